@@ -39,7 +39,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class CaptureRequest:
-    """`save(captured)` must write the capture to disk; `saved()` is called after it, both on the acquisition thread.
+    """A request to capture: `save(captured)` writes it to disk, then `saved()` is called, on the acquisition thread.
 
     The frames, of each of `exposures_ms` where there are any, are overwritten by the next capture.
     """
@@ -66,7 +66,7 @@ class _Task:
 
 
 class Acquisition:
-    """The devices and the requests to them. Every method may be called from any thread, and returns at once.
+    """Owns the devices and the queue of requests. Every method may be called from any thread, and returns at once.
 
     `offer(frame)` gets every preview (h, w), a fresh array each, and must return at once too.
     """
@@ -143,7 +143,7 @@ class Acquisition:
 
     def capture(self, request: CaptureRequest) -> None:
         """Queue a capture. Raises DeviceError where no rig is open."""
-        self._queue(request)
+        self._queue_request(request)
 
     def run_task(self, name: str, task: Callable[[Rig, Progress], T], done: Callable[[T], None]) -> None:
         """Queue other work with the open rig; `done(result)` is called on this thread, and must return at once.
@@ -152,11 +152,13 @@ class Acquisition:
         `view().capture`, and raises Cancelled. What the task raises is reported like a capture's fault. Raises
         DeviceError where no rig is open.
         """
-        self._queue(_Task(name, task, done))
+        self._queue_request(_Task(name, task, done))
 
     def stream(self, stream: Stream) -> None:
-        """Show and grab this repeatedly, in place of previews, until `stop_stream`, a request, another rig or a fault,
-        each of which calls `stream.end()`. Raises DeviceError where no rig is open or something else runs on it.
+        """Show and grab a stream repeatedly, in place of previews, until it is stopped.
+
+        `stop_stream`, a request, another rig or a fault stop it, each of which calls `stream.end()`. Raises DeviceError
+        where no rig is open or something else runs on it.
         """
         with self._condition:
             if self._view.state != "open":
@@ -190,13 +192,13 @@ class Acquisition:
             return not self._requests and self._view.capture is None
 
     def names(self) -> list[str]:
-        """Captures and tasks that run or wait."""
+        """Names of the captures and tasks that run or wait."""
         with self._condition:
             running = [] if self._view.capture is None else [self._view.capture.name]
             return running + [request.name for request in self._requests]
 
     def view(self) -> RigView:
-        """The devices as they are now."""
+        """Return the current state of the devices, with the number of waiting requests."""
         with self._condition:
             capture = self._view.capture
             if capture is None:
@@ -213,7 +215,8 @@ class Acquisition:
         if self._thread is not None:
             self._thread.join(5.0)
 
-    def _queue(self, request: CaptureRequest | _Task) -> None:
+    def _queue_request(self, request: CaptureRequest | _Task) -> None:
+        """Append a capture or task to the queue, and end the stream. Raises DeviceError where no rig is open."""
         with self._condition:
             if self._view.state != "open":
                 raise DeviceError(f"{request.name} is not possible: {self._view.fault or _NOT_OPEN}")
@@ -224,6 +227,7 @@ class Acquisition:
     # on the thread
 
     def _serve(self) -> None:
+        """Run the acquisition loop until closing: change rigs, open devices, serve requests, stream, grab previews."""
         next_preview = 0.0
         while True:
             with self._condition:
@@ -256,10 +260,11 @@ class Acquisition:
                     self._grab_preview(rig)
             except Exception as error:
                 self._handle_fault(error)
-            self._sleep(next_preview)
+            self._wait_for_work(next_preview)
         self._close_devices()
 
-    def _sleep(self, next_preview: float) -> None:
+    def _wait_for_work(self, next_preview: float) -> None:
+        """Wait until the next preview or opening attempt is due, or a request arrives; do not wait while streaming."""
         with self._condition:
             if self._closing or self._requests or self._rig is not self._wanted:
                 return
@@ -271,6 +276,7 @@ class Acquisition:
                 self._condition.wait(min(pause, RETRY_S))
 
     def _open_devices(self, rig: Rig) -> None:
+        """Open the rig's devices and grab a first preview; report a lost rig that answers again."""
         self._next_try = time.monotonic() + RETRY_S
         rig.open()
         self._is_open, self._applied, self._shown = True, None, None
@@ -280,8 +286,8 @@ class Acquisition:
         if was_lost:
             self._notices.add("good", "the rig answers again")
 
-    def _prepare(self, rig: Rig) -> None:
-        """Set camera and light as last requested."""
+    def _prepare_devices(self, rig: Rig) -> None:
+        """Set camera and projector light as last requested."""
         self._apply_settings(rig)
         with self._condition:
             light = self._light
@@ -295,6 +301,7 @@ class Acquisition:
             self._shown = light
 
     def _apply_settings(self, rig: Rig) -> None:
+        """Apply changed camera settings; publish the applied exposure and gain, and the camera's notes."""
         with self._condition:
             settings = self._settings
         if self._applied is None or settings != self._applied:
@@ -308,14 +315,15 @@ class Acquisition:
             self._update_view(exposure_ms=actual.exposure_ms, gain=actual.gain, notes=notes)
 
     def _grab_preview(self, rig: Rig) -> None:
-        self._prepare(rig)
+        """Grab one frame (h, w) under the requested light, and offer it as a preview."""
+        self._prepare_devices(rig)
         width, height = rig.camera.size
         frame = np.empty((height, width), rig.camera.dtype)
         rig.camera.grab(frame)
         self._offer(frame)
 
     def _serve_stream(self, rig: Rig, stream: Stream) -> None:
-        """One capture of a stream, broken off where something else is wanted."""
+        """Capture a stream's sequence once; aborted where something else is requested."""
         self._apply_settings(rig)
         try:
             if self._shown != (_STREAM, stream.sequence):
@@ -335,11 +343,12 @@ class Acquisition:
             self._offer(white)
 
     def _serve_request(self, rig: Rig, request: CaptureRequest | _Task) -> None:
+        """Execute a queued capture or task and report how it ended; a DeviceError is raised to the caller."""
         try:
-            self._prepare(rig)
+            self._prepare_devices(rig)
             self._shown = None  # the request shows and sets its own from here on
             if isinstance(request, CaptureRequest):
-                out = self._buffer_of(rig, request.frames)
+                out = self._get_buffer(rig, request.frames)
                 request.save(capture_with_texture(rig, request.sequence, request.exposures_ms, out, self._report_frame))
                 request.saved()
             else:
@@ -356,8 +365,8 @@ class Acquisition:
                 self._view = replace(self._view, capture=None)  # whichever rig is wanted by now
             self._changed()
 
-    def _buffer_of(self, rig: Rig, count: int) -> np.ndarray:
-        """One buffer for all captures of one size: the page faults of a fresh one would slow down the capture."""
+    def _get_buffer(self, rig: Rig, count: int) -> np.ndarray:
+        """Return the frame buffer (count, h, w), reused between captures of one size to avoid page faults."""
         width, height = rig.camera.size
         shape, dtype = (count, height, width), rig.camera.dtype
         if self._buffer is None or self._buffer.shape != shape or self._buffer.dtype != dtype:
@@ -366,6 +375,7 @@ class Acquisition:
         return self._buffer
 
     def _report_frame(self, frame: int, frames: int, stage: str = "") -> None:
+        """Publish the progress of the running capture. Raises Cancelled once it was cancelled."""
         if self._cancel:
             raise Cancelled("cancelled")
         with self._condition:
@@ -376,10 +386,11 @@ class Acquisition:
         self._changed()
 
     def _report_stage(self, share: float, stage: str) -> None:
+        """Publish the progress of a task, `share` 0 ... 1, as percent. Raises Cancelled once it was cancelled."""
         self._report_frame(round(100 * share), 100, stage)
 
     def _handle_fault(self, error: Exception) -> None:
-        """Close the devices until they open again."""
+        """Report a device fault, close the devices, drop waiting requests and end the stream."""
         text = describe_error("the rig", error)
         self._close_devices()
         with self._condition:
@@ -397,6 +408,7 @@ class Acquisition:
         self._changed()
 
     def _close_devices(self) -> None:
+        """Close the open devices; what they raise is logged."""
         if self._rig is not None and self._is_open:
             self._is_open = False
             try:
@@ -405,6 +417,7 @@ class Acquisition:
                 describe_error("closing the rig", error)
 
     def _update_view(self, **changes: Any) -> None:
+        """Replace fields of the rig's view, unless another rig was chosen meanwhile, and notify."""
         with self._condition:
             if self._rig is self._wanted:
                 self._view = replace(self._view, **changes)

@@ -28,7 +28,7 @@ PATIENCE_S = 120.0
 
 
 class Autopilot:
-    """The whole wizard once. The snapshot names the current act; `before(act)` is called at the start of each."""
+    """Runs the whole wizard once. The snapshot names the current act; `before(act)` is called at the start of each."""
 
     def __init__(
         self,
@@ -41,21 +41,23 @@ class Autopilot:
         self._operator, self._before = operator, before
         self._poses, self._pause_s = poses, pause_s
         self._stopped = threading.Event()
-        self._thread = threading.Thread(target=self._play, name="slviewer autopilot", daemon=True)
+        self._thread = threading.Thread(target=self._run_and_report, name="slviewer autopilot", daemon=True)
 
     @property
     def running(self) -> bool:
+        """Whether the autopilot's thread is alive."""
         return self._thread.is_alive()
 
     def start(self) -> None:
-        """Begin on a thread of its own."""
+        """Start the autopilot on a thread of its own."""
         self._thread.start()
 
     def stop(self) -> None:
         """Send no more requests; those under way are completed."""
         self._stopped.set()
 
-    def _play(self) -> None:
+    def _run_and_report(self) -> None:
+        """Run all acts, and report completion, cancellation or failure as a notice."""
         try:
             self.run()
             self._operator.notify("good", "autopilot has finished: every step is done")
@@ -73,85 +75,93 @@ class Autopilot:
             self._verify()
             self._scan()
             self._measure()
-            self._act("Writing the report", self._operator.report)
+            self._perform_act("Writing the report", self._operator.report)
         finally:
             self._operator.set_autopilot_status("")
 
     def _prepare(self) -> None:
+        """Choose the simulated rig and the target, unless they are in use. Raises SlviewerError."""
         operator = self._operator
-        if not self._settled().rig.simulated:
-            self._act("Choosing the simulated rig", lambda: operator.choose_rig(RIG))
+        if not self._wait_until_settled().rig.simulated:
+            self._perform_act("Choosing the simulated rig", lambda: operator.choose_rig(RIG))
         if operator.wait_for(lambda s: s.rig.state == "open", PATIENCE_S) is None:
             raise SlviewerError("the simulated rig does not open")
-        session = self._settled().session
+        session = self._wait_until_settled().session
         if session is None:
             raise SlviewerError("no session is open: open or create one first")
         if session.target != TARGET:
-            self._act(f"Choosing the target {TARGET}", lambda: operator.choose_target(TARGET))
+            self._perform_act(f"Choosing the target {TARGET}", lambda: operator.choose_target(TARGET))
 
     def _calibrate(self) -> None:
+        """Capture suggested poses until there are enough, then calibrate. Raises SlviewerError if too many fail."""
         operator = self._operator
         tried = 0
-        while (good := _good_poses(now := self._settled())) < self._poses and not (now.session and now.session.enough):
+        while (good := _count_good_poses(now := self._wait_until_settled())) < self._poses and not (
+            now.session and now.session.enough
+        ):
             tried += 1
             if tried > 2 * self._poses:
                 raise SlviewerError(f"only {good} of {tried} poses could be used: see why the others were refused")
             session = operator.snapshot().session
             act = session.suggestion.sentence if session and session.suggestion else "Placing the board"
-            self._act(act, operator.place_at_suggestion)
-            self._act(f"Capturing pose {good + 1} of {self._poses}", operator.capture_pose)
-        self._act("Calibrating", operator.calibrate)
+            self._perform_act(act, operator.place_at_suggestion)
+            self._perform_act(f"Capturing pose {good + 1} of {self._poses}", operator.capture_pose)
+        self._perform_act("Calibrating", operator.calibrate)
 
     def _verify(self) -> None:
+        """Capture a simulated plane and a simulated sphere."""
         operator = self._operator
         self._place("plane", planes()[PLANE])
-        self._act("Capturing a plane", lambda: operator.capture_plane("A flat plate"))
+        self._perform_act("Capturing a plane", lambda: operator.capture_plane("A flat plate"))
         self._place("sphere", spheres()[SPHERE])
-        self._act("Capturing a sphere", lambda: operator.capture_sphere("A sphere of 196 mm"))
+        self._perform_act("Capturing a sphere", lambda: operator.capture_sphere("A sphere of 196 mm"))
 
     def _scan(self) -> None:
+        """Scan the simulated object at three distances, and merge the scans."""
         operator = self._operator
-        before = {scan.name for scan in _scans(operator.snapshot())}
+        before = {scan.name for scan in _list_scans(operator.snapshot())}
         for label, scene in zip(("near", "middle", "far"), objects().values(), strict=True):
             self._place("object", scene)
-            self._act(f"Scanning the object, {label}", partial(operator.capture_scan, f"Ammonite, {label}"))
-        names = [scan.name for scan in _scans(operator.snapshot()) if scan.name not in before]
-        self._act("Merging the three scans", lambda: operator.merge(names, names[-1]))
+            self._perform_act(f"Scanning the object, {label}", partial(operator.capture_scan, f"Ammonite, {label}"))
+        names = [scan.name for scan in _list_scans(operator.snapshot()) if scan.name not in before]
+        self._perform_act("Merging the three scans", lambda: operator.merge(names, names[-1]))
 
     def _measure(self) -> None:
         """Measure the sphere's radius and the object's width."""
         operator = self._operator
         scans = operator.snapshot().session.scans  # type: ignore[union-attr]
         sphere = next(scan.name for scan in reversed(scans) if scan.purpose == "sphere")
-        region = _cap(operator.surface(sphere))
-        self._act("Measuring the sphere", partial(operator.measure, sphere, add_fit, "sphere", region))
-        latest = _scans(operator.snapshot())[-1].name
-        a, b = _across(operator.surface(latest))
-        self._act("Measuring the width of the object", partial(operator.measure, latest, add_distance, a, b))
+        region = _make_ball_region(operator.surface(sphere))
+        self._perform_act("Measuring the sphere", partial(operator.measure, sphere, add_fit, "sphere", region))
+        latest = _list_scans(operator.snapshot())[-1].name
+        a, b = _select_width_ends(operator.surface(latest))
+        self._perform_act("Measuring the width of the object", partial(operator.measure, latest, add_distance, a, b))
 
     def _place(self, thing: Thing, scene: Scene) -> None:
+        """Request that an object be placed at its scene's pose in front of the simulated rig."""
         T = np.eye(4)
         if isinstance(scene, Spheres):
             T[:3, 3] = scene.centres[0]
         else:
             assert isinstance(scene, BoardScene | MeshScene)
             T[:3, :3], T[:3, 3] = scene.pose.R, scene.pose.t
-        self._act(f"Placing the {thing}", lambda: self._operator.place(thing, T))
+        self._perform_act(f"Placing the {thing}", lambda: self._operator.place(thing, T))
 
-    def _act(self, act: str, request: Callable[[], bool]) -> None:
-        """One request, until all that follows from it has ended."""
+    def _perform_act(self, act: str, request: Callable[[], bool]) -> None:
+        """Send one request and wait until all its work has ended. Raises SlviewerError with the notice of a failure."""
         self._operator.set_autopilot_status(act)
         self._before(act)
         if self._stopped.wait(self._pause_s):
             raise Cancelled("autopilot was stopped")
         last = max((notice.number for notice in self._operator.snapshot().notices), default=0)
         request()
-        after = self._settled()
+        after = self._wait_until_settled()
         for notice in after.notices:
             if notice.number > last and notice.level == "error":
                 raise SlviewerError(f"{act}: {notice.text}")
 
-    def _settled(self) -> Snapshot:
+    def _wait_until_settled(self) -> Snapshot:
+        """Wait until no work runs; returns the snapshot. Raises Cancelled when stopped, SlviewerError on timeout."""
         end = time.monotonic() + PATIENCE_S
         while True:
             if self._stopped.is_set():
@@ -163,25 +173,27 @@ class Autopilot:
                     raise
 
 
-def _good_poses(snapshot: Snapshot) -> int:
+def _count_good_poses(snapshot: Snapshot) -> int:
+    """Count the poses that a calibration can use."""
     poses = snapshot.session.poses if snapshot.session else ()
     return sum(pose.state in ("good", "used", "unused") for pose in poses)
 
 
-def _cap(on: MeasuredSurface) -> Region:
-    """A ball around the point nearest to the camera, of half the measured extent."""
+def _make_ball_region(on: MeasuredSurface) -> Region:
+    """Return a ball around the point nearest to the camera, its radius half the measured extent."""
     z = np.where(on.measured, on.points[..., 2], np.inf)
     top = on.points[np.unravel_index(int(np.argmin(z)), z.shape)]
     away = np.linalg.norm(on.points[on.measured] - top, axis=-1)
     return Region.ball(top, 0.5 * float(np.percentile(away, 95)))
 
 
-def _across(on: MeasuredSurface) -> tuple[Place, Place]:
-    """The two ends of the image row in which most was measured."""
+def _select_width_ends(on: MeasuredSurface) -> tuple[Place, Place]:
+    """Return the two end pixels (u, v) of the image row with the most measured points."""
     v = int(np.argmax(on.measured.sum(axis=1)))
     columns = np.flatnonzero(on.measured[v])
     return (int(columns[0]), v), (int(columns[-1]), v)
 
 
-def _scans(snapshot: Snapshot) -> list[ScanView]:
+def _list_scans(snapshot: Snapshot) -> list[ScanView]:
+    """List the captures of objects, without planes and spheres."""
     return [scan for scan in (snapshot.session.scans if snapshot.session else ()) if scan.purpose == "scan"]

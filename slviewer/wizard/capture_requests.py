@@ -25,7 +25,7 @@ class CaptureRequests(ResultRequests):
 
     @request("Capturing the pose")
     def capture_pose(self) -> None:
-        """Capture the board where it is; it is judged in the background."""
+        """Capture the board where it is; its features are evaluated in the background."""
         self._engine.hands_free.note_capture()  # first: a capture that fails is not repeated with every preview
         self._capture_pose(self._next_name("pose"), retake=False)
 
@@ -58,12 +58,14 @@ class CaptureRequests(ResultRequests):
         self._engine.hands_free.switch(on)
 
     def _capture_pose(self, name: str, retake: bool) -> None:
+        """Queue the capture of a target pose; `retake` replaces the one of that name."""
         engine, store, target = self._engine, self._engine.store, self._engine.reader.target()
         if not target:
             raise InputError("choose the target first: a pose is judged by it")
         sequence, source = pose_sequence(engine), engine.acquisition.view().name
 
         def save(captured: CapturedFrames) -> None:
+            """Save the captured frames as a target pose; a retaken pose is included again."""
             save_frames(
                 store,
                 name,
@@ -78,10 +80,10 @@ class CaptureRequests(ResultRequests):
             if retake and name in store.excluded():
                 store.include(name)
 
-        self._queue(name, sequence, save)
+        self._queue_capture(name, sequence, save)
 
     def _capture_scan(self, purpose: Purpose, label: str, follow: Callable[[str], object]) -> None:
-        """Capture anything but the target, and call `follow(name)` once it is saved."""
+        """Queue the capture of a scan, plane or sphere; `follow(name)` is called once it is saved."""
         engine, store = self._engine, self._engine.store
         calibration = engine.publisher.refresh().calibration
         if calibration is None:
@@ -92,23 +94,26 @@ class CaptureRequests(ResultRequests):
         name, source = self._next_name(purpose), engine.acquisition.view().name
 
         def save(captured: CapturedFrames) -> None:
+            """Save the captured frames as a scan, with the operator's label."""
             save_frames(store, name, "scan", sequence, captured, source=source, purpose=purpose)
             self._set_label(name, label)
 
-        self._queue(name, sequence, save, lambda: follow(name))
+        self._queue_capture(name, sequence, save, lambda: follow(name))
 
-    def _queue(
+    def _queue_capture(
         self,
         name: str,
         sequence: PatternSequence,
         save: Callable[[CapturedFrames], None],
         follow: Callable[[], object] = lambda: None,
     ) -> None:
+        """Queue a capture; `follow()` is called once it is saved. Raises SessionError where the disk is too full."""
         engine, bench = self._engine, self._engine.bench
         exposures = engine.reader.exposures_ms()
         self._check_space(name, len(sequence.frames) * max(1, len(exposures)))
 
         def saved() -> None:
+            """Queue the processing of the saved capture, call `follow`, and advance a replayed recording."""
             engine.queue_processing()
             follow()
             engine.publisher.mark_changed(session=True)
@@ -120,6 +125,7 @@ class CaptureRequests(ResultRequests):
         engine.acquisition.capture(CaptureRequest(name, sequence, save, saved, exposures))
 
     def _set_label(self, name: str, label: str) -> None:
+        """Store the operator's label of a capture, unless it is blank."""
         store = self._engine.store
         if label.strip():
             store.decide("names", {**(store.decision("names") or {}), name: label.strip()})
@@ -134,7 +140,7 @@ class CaptureRequests(ResultRequests):
             )
 
     def _next_name(self, kind: str) -> str:
-        """A name that no capture has, saved or waiting."""
+        """Return the next unused name, such as pose_07, counting saved and queued captures."""
         used_names = [*self._engine.store.capture_names(), *self._engine.acquisition.names()]
         numbers = [name.removeprefix(f"{kind}_") for name in used_names if name.startswith(f"{kind}_")]
         number = max((int(number) for number in numbers if number.isdecimal()), default=0) + 1
@@ -142,7 +148,7 @@ class CaptureRequests(ResultRequests):
 
 
 def pose_sequence(engine: Engine) -> PatternSequence:
-    """Both axes of the session's pattern sequence for the rig's projector, or the sequence of a recording."""
+    """Return the sequence for target poses: the session's pattern sequence along both axes, or that of a recording."""
     if engine.bench is None:
         raise DeviceError("no rig is chosen: choose one in the step Rig")
     sequence = choose_sequence(engine.bench, engine.reader.patterns())
@@ -151,6 +157,6 @@ def pose_sequence(engine: Engine) -> PatternSequence:
 
 
 def depth_axis(rig: StereoRig) -> Axis:
-    """The axis along which the projector's coordinate changes more with depth."""
+    """Return the axis along which the projector's coordinate changes more with depth."""
     shift = np.abs(np.diag(rig.projector.K)[:2] * rig.t[:2])
     return "x" if shift[0] >= shift[1] else "y"

@@ -31,7 +31,7 @@ PACKAGES = ("numpy", "opencv-python-headless", "numba", "scipy", "zarr", "open3d
 
 
 class LogKeeper(logging.Handler):
-    """The latest lines of slviewer's log, until `close`."""
+    """Logging handler that stores the latest lines of slviewer's log until `close`."""
 
     def __init__(self) -> None:
         super().__init__(logging.INFO)
@@ -59,12 +59,12 @@ def write_bundle(
     name = f"diagnostics_{datetime.now():%Y%m%d_%H%M%S}.zip"
     with staged_export(session, name, report) as path, zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as bundle:
         report(0.1, "versions and settings")
-        bundle.writestr("versions.json", to_json(_versions()))
-        bundle.writestr("state.json", _without_passwords(to_json(_state(snapshot)).decode()))
-        bundle.writestr("log.txt", _without_passwords("\n".join(log.lines) + "\n"))
+        bundle.writestr("versions.json", to_json(_collect_versions()))
+        bundle.writestr("state.json", _mask_passwords(to_json(_summarise_state(snapshot)).decode()))
+        bundle.writestr("log.txt", _mask_passwords("\n".join(log.lines) + "\n"))
         for file in ("session.json", "decisions.json"):
             if (session.folder / file).is_file():
-                bundle.writestr(f"session/{file}", _without_passwords((session.folder / file).read_text("utf-8")))
+                bundle.writestr(f"session/{file}", _mask_passwords((session.folder / file).read_text("utf-8")))
         report(0.4, "captures and results")
         for capture in session.captures():
             described = {key: value for key, value in capture.meta.items() if key != "sequence"}
@@ -83,11 +83,13 @@ def write_bundle(
     return name
 
 
-def _without_passwords(text: str) -> str:
+def _mask_passwords(text: str) -> str:
+    """Return the text with the credentials in URLs replaced by "…"."""
     return _PASSWORD.sub("…", text)
 
 
-def _versions() -> dict[str, Any]:
+def _collect_versions() -> dict[str, Any]:
+    """Return the versions of slviewer, Python, the operating system and the installed packages."""
     versions = {}
     for package in PACKAGES:
         try:
@@ -103,8 +105,8 @@ def _versions() -> dict[str, Any]:
     }
 
 
-def _state(snapshot: Snapshot) -> dict[str, Any]:
-    """The snapshot's plain part: devices, steps, notices, how much space there is."""
+def _summarise_state(snapshot: Snapshot) -> dict[str, Any]:
+    """Return the serialisable part of the snapshot: devices, steps, notices, disk space."""
     rig = asdict(snapshot.rig)
     notices = [[notice.time.isoformat(), notice.level, notice.text] for notice in snapshot.notices]
     space = None if snapshot.space is None else asdict(snapshot.space)

@@ -82,12 +82,13 @@ class Engine:
 
     @property
     def session(self) -> Session | None:
+        """The open session; None where none is open."""
         reader = self._reader
         return None if reader is None else reader.session
 
     @property
     def reader(self) -> SessionReader:
-        """Of the open session. Raises SessionError where none is open."""
+        """The reader of the open session. Raises SessionError where none is open."""
         reader = self._reader
         if reader is None:
             raise SessionError("no session is open: open or create one first")
@@ -125,11 +126,12 @@ class Engine:
             if before is not None:
                 before.close()
             try:
-                self._use_rig_of(store, rig)
+                self._restore_rig(store, rig)
             finally:
                 self.update_board()
 
-    def _use_rig_of(self, store: Session, rig: Choice | None) -> None:
+    def _restore_rig(self, store: Session, rig: Choice | None) -> None:
+        """Use `rig`, else the rig saved in the session, else save the current one there; report one that fails."""
         choice = rig or store.decision("rig")
         if choice and choice != self._choice:
             try:
@@ -147,8 +149,10 @@ class Engine:
                 self.acquisition.set_camera(CameraSettings(**exposure))
 
     def use_rig(self, choice: Choice) -> None:
-        """Use other devices from now on. If it is the same rig again, the measured delay stays unless the choice has
-        one, and so does the exposure that the session remembers.
+        """Use other devices from now on, in the session too.
+
+        If it is the same rig again, the measured delay stays unless the choice has one, and so does the exposure that
+        the session remembers.
         """
         with self.lock:
             store = self.session
@@ -156,7 +160,7 @@ class Engine:
             same = {**known, "settle_ms": None} == {**choice, "settle_ms": None}
             if same and "settle_ms" in known and "settle_ms" not in choice:
                 choice = {**choice, "settle_ms": known["settle_ms"]}
-            bench = self._set_up(choice, self._board())
+            bench = self._set_up(choice, self._parse_board())
             if store is not None and known != dict(choice):
                 store.decide("rig", dict(choice))
             if store is not None and not same:
@@ -169,7 +173,7 @@ class Engine:
             self.acquisition.use(bench.rig, CameraSettings(**exposure) if exposure else None)
 
     def save_rig(self, name: str, what: str) -> None:
-        """Save the rig in use, with its exposure, as one of the session's own."""
+        """Save the rig in use, with its exposure, as a preset of the session."""
         if self._choice is None:
             raise InputError("no rig is in use: choose one in the step Rig")
         now = self.acquisition.view()
@@ -177,8 +181,10 @@ class Engine:
         save_rig(self.store, name, {**self._choice, **{k: v for k, v in exposure.items() if v}}, what)
 
     def set_preflight(self, bench: RigSetup | None, result: Preflight) -> bool:
-        """Store the result of a check, and use the delay that it measured; the session remembers it with the rig.
-        Returns False, and changes nothing, where `bench` is no longer in use."""
+        """Store the result of a rig check, and use the delay that it measured; the session remembers it with the rig.
+
+        Returns False, and changes nothing, where `bench` is no longer in use.
+        """
         with self.lock:
             if self.bench is not bench:
                 return False
@@ -191,15 +197,15 @@ class Engine:
             return True
 
     def update_board(self) -> None:
-        """Detect the board that is now the target, put it before a simulated rig, and judge the poses by it."""
-        board, world = self._board(), self.bench.world if self.bench else None
+        """Apply the current target: print it on the simulated board, and queue the evaluation of the poses by it."""
+        board, world = self._parse_board(), self.bench.world if self.bench else None
         if board is not None and world is not None and board != world.board:
             world.print_board(board)
         self.queue_processing()
         self.publisher.mark_changed(session=True)
 
     def space(self, frames: int | None = None) -> Space | None:
-        """Free space on the session's disk, and what so many frames need; None without a session."""
+        """Return the free space on the session's disk, and what so many frames need; None without a session."""
         store, rig = self.session, self.acquisition.view()
         if store is None:
             return None
@@ -209,16 +215,16 @@ class Engine:
         return Space(shutil.disk_usage(store.folder).free, needed)
 
     def set_live(self, live: LiveScan) -> None:
-        """This is the live scan from now on."""
+        """Set the current live scan."""
         self.live = live
 
     def set_autopilot(self, act: str) -> None:
-        """What the autopilot does now; empty: it is off."""
+        """Set the autopilot's current act; empty: it is off."""
         self._autopilot = act
         self.publisher.mark_changed()
 
     def set_merge_failure(self, why: str) -> None:
-        """Why the last merge failed; empty: it did not."""
+        """Set the reason why the last merge failed; empty: it did not."""
         self._merge_failure = why
         self.publisher.mark_changed()
 
@@ -234,14 +240,15 @@ class Engine:
                 self.session.close()
         self.log.close()
 
-    def _board(self) -> Board | None:
+    def _parse_board(self) -> Board | None:
+        """Return the board of the session's target; None where none is chosen."""
         target = self._reader.target() if self._reader else ""
         return Board.parse(target) if target else None
 
     # the background
 
     def queue_processing(self) -> None:
-        """Judge poses and make thumbnails, in the background, where they are missing."""
+        """Queue background jobs for captures without thumbnail, frame check or pose features."""
         reader = self._reader
         if reader is None:
             return
@@ -254,19 +261,20 @@ class Engine:
                 self._queued.add(key)
             self.jobs.submit(
                 f"Processing {capture.name}",
-                partial(self._process, reader, capture),
+                partial(self._process_capture, reader, capture),
                 lambda _: self.publisher.mark_changed(session=True),
                 failed=partial(self._handle_processing_failure, reader, capture),
                 background=True,
             )
 
     def reprocess(self, capture: Capture) -> None:
-        """As `queue_processing`, for a capture that was processed before and whose results are gone."""
+        """Process a restored capture again, whose results no longer exist."""
         with self.lock:
             self._queued = {key for key in self._queued if key[0] != capture.hash}
         self.queue_processing()
 
-    def _process(self, reader: SessionReader, capture: Capture, report: Reporter) -> None:
+    def _process_capture(self, reader: SessionReader, capture: Capture, report: Reporter) -> None:
+        """Make the thumbnail of a capture, check its frames, and read its features if it is a target pose."""
         if capture.name not in reader.session.capture_names():
             return  # deleted since
         if not reader.has_thumbnail(capture):
@@ -285,6 +293,7 @@ class Engine:
             self.publisher.mark_changed(session=True)
 
     def _handle_processing_failure(self, reader: SessionReader, capture: Capture, error: BaseException) -> None:
+        """Report that a capture could not be processed, and store why it is unreadable."""
         self.notices.add_failure(f"Processing {capture.name}", error)
         if isinstance(error, InputError):
             reader.add_unreadable(capture, str(error))
@@ -293,7 +302,7 @@ class Engine:
     # previews
 
     def _handle_preview(self, view: PreviewView) -> None:
-        """A preview was analysed (on the preview's thread)."""
+        """Publish an analysed preview, trigger hands-free capture, and update the brightness (preview thread)."""
         countdown = self.hands_free.countdown(view.board, not self.acquisition.idle, time.monotonic())
         now = countdown is not None and countdown <= 0
         self.preview = view = replace(view, countdown_s=None if now else countdown)
@@ -310,7 +319,7 @@ class Engine:
     # snapshots
 
     def _build_snapshot(self, version: int, session_changed: bool) -> Snapshot:
-        """The snapshot of this moment; it changes nothing (on the publisher's thread)."""
+        """Build the current snapshot without changing any state (publisher's thread)."""
         reader, bench, choice, rig = self._reader, self.bench, self._choice, self.acquisition.view()
         session, read_failure = self.publisher.latest.session, self.publisher.latest.read_failure
         if reader is None or (session is not None and session.folder != reader.session.folder):
@@ -350,14 +359,14 @@ class Engine:
         )
 
     def _follow_up(self, snapshot: Snapshot) -> None:
-        """Do what a new snapshot requires (on the publisher's thread)."""
+        """Act on a new snapshot: retry failed reads, plan the next pose, end hands-free capture."""
         self._failed_reads = self._failed_reads + 1 if snapshot.read_failure else 0
         if 0 < self._failed_reads < READ_ATTEMPTS:
             self.publisher.mark_changed(session=True)
         elif self._failed_reads == READ_ATTEMPTS:  # reported once, until it can be read again
             self.notices.add("error", snapshot.read_failure)
         session = snapshot.session
-        self.watcher.watch(_watch(session))
+        self.watcher.watch(_choose_watch(session))
         if session is None:
             return
         if session.pending_plan is not None:
@@ -369,8 +378,8 @@ class Engine:
             self.notices.add("good", "the poses reach the wanted accuracy: hands-free capture has stopped")
 
 
-def _watch(session: SessionView | None) -> Watch:
-    """What previews are searched for in a session."""
+def _choose_watch(session: SessionView | None) -> Watch:
+    """Return what to detect in the previews: the session's board, and the lens to estimate its pose with."""
     if session is None or not session.target:
         return Watch()
     return Watch(Board.parse(session.target), session.plan.lens if session.plan else None)

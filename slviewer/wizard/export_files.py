@@ -18,7 +18,7 @@ from slviewer.wizard.snapshot import ExportView
 
 @contextmanager
 def staged_export(session: Session, name: str, report: Reporter) -> Iterator[Path]:
-    """A path to write `name` to; when the block ends the file appears in the exports, unless the work was cancelled."""
+    """Yield a temporary path for `name`; at the end the file is moved to the exports, unless the work was cancelled."""
     target = session.exports / safe_name(name)
     with atomic.staged_folder(target, 0) as folder:
         yield folder / name
@@ -30,7 +30,7 @@ def staged_export(session: Session, name: str, report: Reporter) -> Iterator[Pat
 def export_file(
     session: Session, what: What, name: str, file_format: str, plan: MeshingPlan | None, report: Reporter, warn: Warn
 ) -> str:
-    """Write one file, as `pipeline.export.export` does; returns a sentence that begins with its name."""
+    """Write one file, as `pipeline.export.export` does; returns a sentence that begins with the file's name."""
     with staged_export(session, default_file_name(what, name, file_format), report) as path:
         accepts, progress = accepts_rejected(session), report.within(0, 0.98)
         exported = export(
@@ -41,6 +41,6 @@ def export_file(
 
 
 def list_exports(session: Session) -> tuple[ExportView, ...]:
-    """The files in the exports folder."""
+    """List the files in the exports folder, sorted by path."""
     files = sorted(each for each in (session.folder / "exports").glob("[!.]*") if each.is_file())
     return tuple(ExportView(each.name, each, each.stat().st_size) for each in files)

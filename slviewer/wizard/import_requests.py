@@ -20,7 +20,7 @@ UNPACKED = "import"
 
 
 class ImportRequests(RequestHandler):
-    """Imports by the worker, with the function of the command line."""
+    """Requests that import captures on the worker, as the command line does."""
 
     @request(IMPORTING)
     def import_folder(self, folder: Path | str, layout: str = "detect", **options: Any) -> None:
@@ -31,6 +31,7 @@ class ImportRequests(RequestHandler):
         store = self._engine.store
 
         def work(report: Reporter) -> list[str]:
+            """Import the folder's captures; returns their names."""
             session = store.guarded(report.saving)
             source = Path(path).expanduser()
             return import_captures(source, session, layout, progress=report, warn=self._warn, **options)
@@ -44,21 +45,26 @@ class ImportRequests(RequestHandler):
         self._submit_import(partial(self._read_zip, name, content, layout, options))
 
     def _submit_import(self, work: Callable[[Reporter], list[str]]) -> None:
+        """Queue an import; `work(report)` returns the names of the captures, which are then processed."""
+
         def import_and_process(report: Reporter) -> list[str]:
+            """Import, and queue the processing of the new captures; returns their names."""
             names = work(report)
             self._engine.queue_processing()
             return names
 
         def describe(names: list[str]) -> str:
+            """Return a notice with the number and the names of the imported captures."""
             return f"{len(names)} capture{'s' * (len(names) != 1)} imported: {', '.join(names)}"
 
         self._submit(IMPORTING, import_and_process, describe)
 
     def _read_zip(self, name: str, content: bytes, layout: str, options: dict[str, Any], report: Reporter) -> list[str]:
+        """Unpack an uploaded zip into a temporary folder and import it; returns the names of the captures."""
         store, archive = self._engine.store, io.BytesIO(content)
         report(0.0, f"unpacking {name}")
         with atomic.staged_folder(store.folder / UNPACKED, unpacked_size(archive)) as staged:
-            folder = staged / _capture_name(Path(name).stem)
+            folder = staged / _make_capture_name(Path(name).stem)
             folder.mkdir()
             try:
                 unpacking = report.within(0, 0.2)
@@ -73,7 +79,7 @@ class ImportRequests(RequestHandler):
                 atomic.discard(staged)
 
 
-def _capture_name(name: str) -> str:
-    """A name for a capture, from that of the upload."""
+def _make_capture_name(name: str) -> str:
+    """Return a valid capture name, ASCII and at most 100 characters, made from the name of an upload."""
     plain = "".join(c if (c.isalnum() and c.isascii()) or c in "_-." else "_" for c in name).strip("._-")
     return safe_name(plain[:100] or "capture")

@@ -35,6 +35,7 @@ class Reporter:
         self.share, self.stage = 0.0, ""
 
     def __call__(self, share: float, stage: str) -> None:
+        """Report progress: `share` 0 ... 1 and the `stage` in words. Raises Cancelled once the job was cancelled."""
         if share < 1:  # with the last report everything is saved
             with self._lock:
                 self._saving = False
@@ -48,7 +49,7 @@ class Reporter:
             raise Cancelled("cancelled")
 
     def saving(self) -> None:
-        """Called right before a save takes effect: raises Cancelled, or defers cancelling until the next report."""
+        """Mark the start of a save: raises Cancelled, or defers cancelling until the next report."""
         with self._lock:
             if self._cancelled and not self._saving:
                 raise Cancelled("cancelled")
@@ -60,36 +61,44 @@ class Reporter:
             self._cancelled = True
 
     def within(self, start: float, end: float) -> "Reporter":
-        """The reporter of one part of the work, whose own share goes from 0 to 1."""
+        """Return a reporter for one part of the work, which maps its shares 0 ... 1 to `start` ... `end`."""
         return _PartReporter(self, start, min(end, 0.999))  # the last report is the whole work's own
 
     @property
     def cancelled(self) -> bool:
+        """Whether the operator has cancelled the job."""
         return self._cancelled
 
     @property
     def has_saved(self) -> bool:
-        """Whether results are being saved, or were."""
+        """Whether a save has begun since the last report."""
         return self._saving
 
 
 class _PartReporter(Reporter):
+    """A `Reporter` that maps its shares to a part of another's and forwards every call to it."""
+
     def __init__(self, whole: Reporter, start: float, end: float) -> None:
         super().__init__(whole._changed)
         self._whole, self._start, self._end = whole, start, end
 
     def __call__(self, share: float, stage: str) -> None:
+        """Report progress of the part, `share` 0 ... 1, to the whole."""
         self._whole(self._start + (self._end - self._start) * share, stage)
 
     def check(self) -> None:
+        """Raise Cancelled if the whole work was cancelled."""
         self._whole.check()
 
     def saving(self) -> None:
+        """Mark the start of a save in the whole work; raises Cancelled if that was cancelled."""
         self._whole.saving()
 
 
 @dataclass(eq=False)
 class _Job:
+    """A queued or running job: its callbacks, its reporter, and its result or error once `ended` is set."""
+
     name: str
     work: Callable[[Reporter], Any]
     done: Callable[[Any], None] | None
@@ -103,7 +112,7 @@ class _Job:
 
 
 class Jobs:
-    """The worker and what waits for it. Every method may be called from any thread."""
+    """A worker thread with a foreground and a background queue. Every method may be called from any thread."""
 
     def __init__(self, notices: Notices, changed: Callable[[], None]) -> None:
         self._notices, self._changed = notices, changed
@@ -138,7 +147,7 @@ class Jobs:
         self._changed()
 
     def cancel(self) -> None:
-        """Cancel the job that the operator sees, if there is one; those that wait behind it go on."""
+        """Cancel the running foreground job, else the first waiting one; other jobs continue."""
         with self._condition:
             if self._running is not None and not self._running.background:
                 self._running.reporter.cancel()
@@ -148,7 +157,7 @@ class Jobs:
         self._changed()
 
     def cancel_all(self) -> None:
-        """Cancel the running job and drop those that wait, background work too."""
+        """Cancel the running job and drop the waiting ones, background work too."""
         with self._condition:
             self._waiting.clear()
             self._waiting_behind.clear()
@@ -157,7 +166,7 @@ class Jobs:
             self._condition.notify_all()
 
     def view(self) -> JobView | None:
-        """The job that runs, or None."""
+        """Return the running job; None where none runs."""
         with self._condition:
             job, waiting = self._running, len(self._waiting)
         if job is None:
@@ -170,12 +179,12 @@ class Jobs:
 
     @property
     def idle(self) -> bool:
-        """Whether nothing runs and nothing waits."""
+        """Whether no job runs and none waits, background work included."""
         with self._condition:
             return self._running is None and not self._waiting and not self._waiting_behind
 
     def wait_until_idle(self, timeout_s: float) -> bool:
-        """Wait for that; False where it took longer."""
+        """Wait until no job runs or waits; returns False after `timeout_s`."""
         with self._condition:
             return self._condition.wait_for(
                 lambda: self._running is None and not self._waiting and not self._waiting_behind, timeout_s
@@ -189,6 +198,7 @@ class Jobs:
         self._worker.join(4 * PATIENCE_S)
 
     def _serve(self) -> None:
+        """Run the worker loop until closing: take the next job, foreground jobs first, and run it."""
         while True:
             with self._condition:
                 self._running = None
@@ -203,12 +213,13 @@ class Jobs:
                 self._running = job
             self._changed()
             try:
-                self._run(job)
+                self._supervise_job(job)
             except Exception as error:  # whatever it was, the worker lives on
                 self._notices.add_failure(job.name, error)
 
-    def _run(self, job: _Job) -> None:
-        thread = threading.Thread(target=self._work, args=(job,), name=f"slviewer: {job.name}", daemon=True)
+    def _supervise_job(self, job: _Job) -> None:
+        """Run a job on its own thread until it ends or is cancelled, then call `done` or `failed`, or add a notice."""
+        thread = threading.Thread(target=self._execute_job, args=(job,), name=f"slviewer: {job.name}", daemon=True)
         thread.start()
         reporter = job.reporter
         with self._condition:
@@ -229,7 +240,8 @@ class Jobs:
         elif job.done is not None:
             job.done(job.result)
 
-    def _work(self, job: _Job) -> None:
+    def _execute_job(self, job: _Job) -> None:
+        """Execute a job on its own thread, store its result or error, and mark it as ended."""
         try:
             job.result = job.work(job.reporter)
         except BaseException as error:

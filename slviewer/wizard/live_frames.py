@@ -23,7 +23,7 @@ class LiveCapture:
 
 
 class Stream:
-    """A sequence that is shown and grabbed repeatedly; a reader gets the newest complete capture.
+    """A pattern sequence that is captured repeatedly; a reader gets the newest complete capture.
 
     `capture` is called by the thread that owns the devices, `wait_next` by one that reads, the others by any. At most
     three buffers exist: one being filled, one waiting, and one being read. `on_end` is called once, on the thread that
@@ -41,10 +41,9 @@ class Stream:
         """Number of complete captures, including those that nobody read."""
 
     def capture(self, rig: Rig, settings: CameraSettings, stopped: Callable[[], bool]) -> np.ndarray | None:
-        """Show and grab every frame of the sequence, which the rig's projector has loaded. Returns a copy of the last
-        frame; None where it was `stopped` before, and the capture is dropped.
+        """Show and grab every frame of the sequence, which the rig's projector has loaded.
 
-        Raises DeviceError.
+        Returns a copy of the last frame (h, w), or None, and drops the capture, once `stopped()`. Raises DeviceError.
         """
         count, (width, height) = len(self.sequence.frames), rig.camera.size
         frames = self._allocate((count, height, width), rig.camera.dtype)
@@ -58,15 +57,16 @@ class Stream:
         else:
             rig.projector.show(count - 1)  # a change during this exposure is reported at the next call
             last = frames[-1].copy()
-            self._offer(LiveCapture(frames, begun, settings))
+            self._store_newest(LiveCapture(frames, begun, settings))
             return last
         with self._condition:
             self._free.append(frames)
         return None
 
     def wait_next(self) -> LiveCapture | None:
-        """Wait for the newest capture that was not read yet; its frames stay valid until the next call. None once the
-        stream has ended.
+        """Wait for the newest capture that was not read yet, and return it; None once the stream has ended.
+
+        Its frames stay valid until the next call.
         """
         with self._condition:
             self._condition.wait_for(lambda: self.has_ended or self._waiting is not None)
@@ -77,14 +77,14 @@ class Stream:
             return self._read
 
     def copy_latest(self) -> LiveCapture | None:
-        """A copy of the capture that was read last; None before the first."""
+        """Return a copy of the capture that was read last; None before the first."""
         with self._condition:
             if self._read is None:
                 return None
             return LiveCapture(self._read.frames.copy(), self._read.begun, self._read.settings)
 
     def end(self) -> None:
-        """End it: nothing more is captured."""
+        """End the stream: no further captures, and waiting readers get None."""
         with self._condition:
             first, self.has_ended = not self.has_ended, True
             self._condition.notify_all()
@@ -92,13 +92,15 @@ class Stream:
             self._on_end()
 
     def _allocate(self, shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
+        """Return a buffer of this shape and dtype for frames, a free one if it fits."""
         with self._condition:
             buffer = self._free.pop() if self._free else None
         if buffer is None or buffer.shape != shape or buffer.dtype != dtype:
             return allocate_frames(shape, dtype)
         return buffer
 
-    def _offer(self, shot: LiveCapture) -> None:
+    def _store_newest(self, shot: LiveCapture) -> None:
+        """Make a capture the one to read next, and recycle one that was not read."""
         with self._condition:
             self._recycle(self._waiting)  # nobody has read it
             self._waiting = shot
@@ -106,5 +108,6 @@ class Stream:
             self._condition.notify_all()
 
     def _recycle(self, shot: LiveCapture | None) -> None:
+        """Return the buffer of a capture, if there is one, to the free list."""
         if shot is not None:
             self._free.append(shot.frames)

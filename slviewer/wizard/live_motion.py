@@ -48,7 +48,7 @@ def mask_motion(
     power = float((shape[valid] ** 2).sum())
     harmonic = float((shape[valid] * alternation[valid]).sum()) / power if power > 0 and len(finest) == 4 else 0.0
     few, many = (extreme(len(shift.indices) for shift in shifts) for extreme in (min, max))
-    _hide(
+    _mask_moving_pixels(
         frames, indices, begins, signs, modulation, phase, np.float32(harmonic),
         np.float32(noise[0]), np.float32(noise[1]), np.float32(SIGMAS * np.sqrt(1 / few + 1 / many)),
         np.float32(SIGMAS / np.sqrt(len(finest))), np.float32(PART), points,
@@ -56,8 +56,13 @@ def mask_motion(
 
 
 @kernel(parallel=True)
-def _hide(frames, indices, begins, signs, modulation, phase, harmonic, a, b, mean, alternating, part, points):
-    """``mean``, ``alternating``: limits of the two contradictions, in standard deviations of a frame's noise."""
+def _mask_moving_pixels(
+    frames, indices, begins, signs, modulation, phase, harmonic, a, b, mean, alternating, part, points
+):
+    """Kernel of `mask_motion`: set `points` (h, w, 3) to NaN where frames of a pixel contradict each other.
+
+    ``mean``, ``alternating``: limits of the two contradictions, in standard deviations of a frame's noise.
+    """
     height, width = modulation.shape
     groups = len(begins) - 1
     for row in numba.prange(height):

@@ -13,11 +13,11 @@ from slviewer.wizard.requests import request
 
 
 class LiveRequests(CaptureRequests):
-    """Starts, saves and stops live scans, and lets callers subscribe to their clouds."""
+    """Requests that start, save and stop live scans, and subscriptions to their clouds."""
 
     @request("Scanning live")
     def start_live(self) -> None:
-        """Show clouds while patterns run, until `stop_live`, a capture, another rig or session, or a fault."""
+        """Start a live scan, which ends at `stop_live`, a capture, another rig or session, or a fault."""
         engine = self._engine
         calibration = engine.publisher.refresh().calibration
         if calibration is None:
@@ -59,8 +59,10 @@ class LiveRequests(CaptureRequests):
         self.reconstruct(name)
 
     def subscribe_live(self, listener: Callable[[LiveCloud], None]) -> Callable[[], None]:
-        """Call back with every live cloud, on the live scan's thread; returns a function that ends this. A listener
-        must return at once."""
+        """Call back with every live cloud, on the live scan's thread; returns a function that unsubscribes.
+
+        A listener must return at once.
+        """
         return self._engine.live_listeners.add(listener)
 
     @property
@@ -69,6 +71,6 @@ class LiveRequests(CaptureRequests):
         return 0 if self._engine.live is None else self._engine.live.stream.captured
 
     def count_live_shown(self, cloud: LiveCloud) -> None:
-        """A listener has sent this cloud to the browsers: the latency ends here."""
+        """Record that a cloud was sent to the browsers, which ends its latency."""
         if self._engine.live is not None:
             self._engine.live.count_shown(cloud)

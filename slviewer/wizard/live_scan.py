@@ -75,41 +75,42 @@ class LiveScan:
         self._thread = threading.Thread(target=self._serve, name="slviewer live", daemon=True)
 
     def start(self) -> None:
-        """Begin. Raises DeviceError if the rig is not ready, SlviewerError if the session has no usable calibration."""
+        """Start capturing. Raises DeviceError if the rig is not ready, SlviewerError without a usable calibration."""
         self._model = LiveCalibration(self._store, self.stream.sequence, self.axis)
         self._acquisition.stream(self.stream)
         self._thread.start()
 
     @property
     def is_running(self) -> bool:
-        """Whether it has not ended."""
+        """Whether the live scan has not ended."""
         return not self.stream.has_ended
 
     def count_shown(self, cloud: LiveCloud) -> None:
-        """A cloud was sent to the browsers."""
+        """Record that a cloud was sent to the browsers, for rate and latency."""
         now = time.monotonic()
         with self._lock:
             self._sent.append((now, now - cloud.begun))
             _drop_old(self._sent, now)
 
     def figures(self) -> LiveView:
-        """Rates of the last two seconds."""
+        """Return the rates and the median latency of the last two seconds."""
         now = time.monotonic()
         with self._lock:
             _drop_old(self._made, now)
             _drop_old(self._sent, now)
             latency_s = float(np.median([late for _, late in self._sent])) if self._sent else None
             return LiveView(
-                clouds_per_s=_rate(self._made),
-                shown_per_s=_rate([at for at, _ in self._sent]),
+                clouds_per_s=_compute_rate(self._made),
+                shown_per_s=_compute_rate([at for at, _ in self._sent]),
                 latency_ms=None if latency_s is None else 1e3 * latency_s,
                 points=self._points,
             )
 
     def _serve(self) -> None:
+        """Compute and publish a cloud of each new capture until the stream ends; a failure ends it with a notice."""
         while (shot := self.stream.wait_next()) is not None:
             try:
-                cloud = self._cloud(shot)
+                cloud = self._compute_cloud(shot)
             except Exception as error:
                 self._notices.add_failure("Live", error)
                 self._acquisition.stop_stream()
@@ -125,7 +126,8 @@ class LiveScan:
                 self._reported = now
                 self._changed()
 
-    def _cloud(self, shot: LiveCapture) -> LiveCloud:
+    def _compute_cloud(self, shot: LiveCapture) -> LiveCloud:
+        """Reconstruct a capture with the current calibration."""
         assert self._model is not None
         points, texture = self._model.current().cloud(shot.frames)
         self._number += 1
@@ -135,8 +137,10 @@ class LiveScan:
 
 @dataclass(eq=False)
 class LiveModel:
-    """A short sequence, a calibration, and the scale that was applied to it; ``calibrated``: the rig whose sizes the
-    frames must have. For one thread at a time."""
+    """Reconstructs short captures: a sequence, a calibration, and the scale applied to it. For one thread at a time.
+
+    ``calibrated``: the rig whose sizes the frames must have.
+    """
 
     sequence: PatternSequence
     axis: Axis
@@ -151,7 +155,7 @@ class LiveModel:
             self._fast = one_pass(self.sequence, self.model, self.axis)
 
     def cloud(self, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(points (h, w, 3) float32 mm, texture (h, w)) of the frames (n, h, w); both are new arrays.
+        """Reconstruct frames (n, h, w): (points (h, w, 3) float32 mm, texture (h, w)), both new arrays.
 
         As in `reconstruct`, but what moved between the frames is NaN too. Raises InputError for frames of another
         sequence or camera.
@@ -160,7 +164,7 @@ class LiveModel:
             height, width = frames.shape[1:]
             check_sizes("the live scan", (width, height), self.sequence.projector_size, self.calibrated)
         if self._fast is not None:
-            scan = self._fast.run(frames, out=self._workspace())
+            scan = self._fast.run(frames, out=self._reuse_workspace())
             self._before, points = scan, scan.points
             phase, modulation, noise = scan.phase, scan.modulation, scan.light.noise
         else:
@@ -172,14 +176,14 @@ class LiveModel:
             points *= np.float32(self.factor)
         return points, frames[-1].copy()
 
-    def _workspace(self) -> PassResult | None:
-        """The arrays of the previous scan, except its points, which may still be drawn."""
+    def _reuse_workspace(self) -> PassResult | None:
+        """Return the previous result with new points, to reuse its other arrays; None at first."""
         before = self._before
         return None if before is None else replace(before, points=np.empty_like(before.points))
 
 
 class LiveCalibration:
-    """The calibration that the session uses, also after it has changed."""
+    """The session's preferred calibration, loaded again when it changes."""
 
     def __init__(self, store: Session, sequence: PatternSequence, axis: Axis) -> None:
         self._store, self._sequence, self._axis = store, sequence, axis
@@ -188,12 +192,13 @@ class LiveCalibration:
         self._current = self._load()
 
     def current(self) -> LiveModel:
-        """The model now, at most a second old. Raises SlviewerError where none is usable any more."""
+        """Return the model, checked for changes at most a second ago. Raises SlviewerError where none is usable."""
         if time.monotonic() - self._loaded > _RELOAD_S:
             self._current = self._load()
         return self._current
 
     def _load(self) -> LiveModel:
+        """Load the session's preferred model and its scale, or return the current one where neither has changed."""
         store = self._store
         self._loaded = time.monotonic()
         name = preferred_model(store)
@@ -211,11 +216,12 @@ class LiveCalibration:
         return LiveModel(self._sequence, self._axis, model, factor, load_stereo(store).rig)
 
 
-def _rate(times: "deque[float] | list[float]") -> float:
-    """Per second, over the time that they span; 0 for fewer than two."""
+def _compute_rate(times: "deque[float] | list[float]") -> float:
+    """Return the rate per second of sorted times in s; 0 for fewer than two."""
     return (len(times) - 1) / (times[-1] - times[0]) if len(times) > 1 and times[-1] > times[0] else 0.0
 
 
 def _drop_old(times: "deque[float] | deque[tuple[float, float]]", now: float) -> None:
+    """Remove entries whose time in s is older than the averaging window from the front of a deque."""
     while times and now - (times[0][0] if isinstance(times[0], tuple) else times[0]) > _AVERAGED_S:
         times.popleft()

@@ -28,12 +28,12 @@ MEASURING, COMPARING = "Measuring", "Comparing with the nominal model"
 
 
 class MeasureRequests(RequestHandler):
-    """Measures on a scan or a merge, by the worker, and edits the list of measurements."""
+    """Requests that measure on a scan or a merge, on the worker, and edit the list of measurements."""
 
     _surfaces: Surfaces
 
     def surface(self, name: str) -> MeasuredSurface:
-        """A scan or merge to measure on; reading it is slow. Raises InputError where it cannot be measured on."""
+        """Load a scan or merge to measure on, which is slow. Raises InputError where it cannot be measured on."""
         return self._surfaces.load(self._engine.store, name)
 
     @request(MEASURING)
@@ -48,6 +48,7 @@ class MeasureRequests(RequestHandler):
         store = self._engine.store
 
         def work(report: Reporter) -> Measurement:
+            """Load the surface, then add and return the measurement."""
             report(0.0, f"measuring on {on}")
             surface = self._surfaces.load(store, on)
             return add(store.guarded(report.saving), surface, *args, **kwargs)
@@ -60,6 +61,7 @@ class MeasureRequests(RequestHandler):
         store = self._engine.store
 
         def work(report: Reporter) -> Measurement:
+            """Add and return the relation of the two measurements."""
             return measurements.add_relation(store.guarded(report.saving), a, b)
 
         self._submit(MEASURING, work, describe_measurement)
@@ -70,6 +72,7 @@ class MeasureRequests(RequestHandler):
         store, plain = self._engine.store, plain_name(name)
 
         def work(report: Reporter) -> str:
+            """Write the upload to the session's nominal models if it can be read; returns its description."""
             report(0.0, f"reading {plain}")
             target = store.folder / NOMINALS / plain
             with atomic.staged_folder(target, len(content)) as folder:
@@ -94,10 +97,11 @@ class MeasureRequests(RequestHandler):
             raise InputError(f"there is no nominal model {nominal!r} in the session: upload it first")
 
         def work(report: Reporter) -> NominalComparison:
+            """Compare the surface with the nominal model, and write the deviations as PLY into the exports."""
             report(0.0, f"reading {nominal}")
             ideal, surface = read_nominal(path, units), self._surfaces.load(store, on)
             name = f"{on.replace('/', '_')}_{path.stem}_deviation.ply"
-            with staged_export(store, name, report) as ply, _wizard_wording():
+            with staged_export(store, name, report) as ply, _reword_errors():
                 result = compare_surface(
                     store.guarded(report.saving),
                     surface,
@@ -116,7 +120,7 @@ class MeasureRequests(RequestHandler):
 
     @request("Renaming")
     def relabel_measurement(self, identity: str, name: str) -> None:
-        """Rename a measurement; an empty name restores the first one."""
+        """Rename a measurement; an empty name restores its original name."""
         measurements.relabel_measurement(self._engine.store, identity, name)
 
     @request("Deleting")
@@ -135,6 +139,7 @@ class MeasureRequests(RequestHandler):
         store = self._engine.store
 
         def work(report: Reporter) -> str:
+            """Write the CSV into the exports; returns a sentence with the number of measurements."""
             with staged_export(store, TABLE, report) as path:
                 count = measurements.export_measurements(store, path)
             report(1.0, "written")
@@ -144,8 +149,8 @@ class MeasureRequests(RequestHandler):
 
 
 @contextmanager
-def _wizard_wording() -> Iterator[None]:
-    """Replaces options of the command line in an error's text by the names of inputs."""
+def _reword_errors() -> Iterator[None]:
+    """Reword InputErrors raised in the block: remove the command line's option ``--units``."""
     try:
         yield
     except InputError as error:
@@ -153,13 +158,13 @@ def _wizard_wording() -> Iterator[None]:
 
 
 def describe_measurement(measured: Measurement) -> str:
-    """A measurement in one sentence."""
+    """Describe a measurement in one sentence: its name and quantities."""
     values = "; ".join(quantity.text() for quantity in measurements.quantities_of(measured))
     return f"{measured.name}: {values}"
 
 
 def describe_comparison(result: NominalComparison) -> str:
-    """A comparison in one sentence."""
+    """Describe a comparison in one sentence: RMS deviation in mm, and the decision against the tolerance."""
     text = f"{result.scan} against {result.nominal.name}: RMS {result.found.statistics()['rms']:.4f} mm"
     if result.verdict is None:
         return text
@@ -167,6 +172,6 @@ def describe_comparison(result: NominalComparison) -> str:
 
 
 def plain_name(name: str) -> str:
-    """A file's name as a session may hold it: ASCII letters, digits, '_', '-' and '.'."""
+    """Return a valid file name for the session: ASCII letters, digits, '_', '-' and '.', at most 100 characters."""
     plain = re.sub(r"[^A-Za-z0-9_.-]+", "_", Path(name).name).lstrip(".-")
     return safe_name(plain[-100:].lstrip(".-") or "nominal")

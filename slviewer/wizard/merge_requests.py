@@ -21,7 +21,7 @@ _ALTERNATIVES = {
 
 
 class MergeRequests(RequestHandler):
-    """Merges by the worker; the reason of a failure stays in the snapshot until the next merge."""
+    """Requests that merge scans on the worker; the snapshot shows why a merge failed until the next one."""
 
     @request(MERGING)
     def merge(
@@ -33,8 +33,9 @@ class MergeRequests(RequestHandler):
         angle: float | None = None,
         picked: Picked | None = None,
     ) -> None:
-        """Register scans, in the order in which they were captured, to a reference, and merge them; `undo_merge`
-        undoes it. `start`, `angle` and `picked` as in `pipeline.merge`.
+        """Register scans, in the order in which they were captured, to a reference, and merge them.
+
+        `undo_merge` undoes it. `start`, `angle` and `picked` as in `pipeline.merge`.
         """
         engine = self._engine
         store = engine.store
@@ -45,6 +46,7 @@ class MergeRequests(RequestHandler):
         )
 
         def failed(error: BaseException) -> None:
+            """Store and report why the merge failed, and suggest another initial alignment where that may help."""
             text = describe_error(MERGING, error)
             if isinstance(error, Refused) and error.reason in ("overlap", "disagree"):
                 text = f"{text} {_ALTERNATIVES['picked' if picked else start]}"

@@ -24,7 +24,7 @@ class Notices:
         self._count = 0
 
     def add(self, level: Level, text: str) -> None:
-        """Add a sentence."""
+        """Add a notice and log it."""
         log.log({"warning": logging.WARNING, "error": logging.ERROR}.get(level, logging.INFO), "%s", text)
         with self._lock:
             self._count += 1
@@ -36,13 +36,13 @@ class Notices:
         self.add("error", describe_error(action, error))
 
     def all(self) -> tuple[Notice, ...]:
-        """The latest notices."""
+        """Return the latest notices, oldest first."""
         with self._lock:
             return tuple(self._latest)
 
 
 def describe_error(action: str, error: BaseException) -> str:
-    """One sentence for the operator; an unexpected error is logged with its traceback."""
+    """Describe an error to the operator in one sentence; an unexpected one is logged with its traceback."""
     if isinstance(error, SlviewerError):
         return str(error)
     log.error("%s failed", action, exc_info=error)

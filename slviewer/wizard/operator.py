@@ -27,20 +27,21 @@ class AutopilotLike(Protocol):
     """Sends requests by itself, on a thread of its own: the autopilot."""
 
     @property
-    def running(self) -> bool: ...
+    def running(self) -> bool:
+        """Whether it is sending requests."""
 
     def start(self) -> None:
-        """Begin to send requests."""
+        """Start sending requests."""
 
     def stop(self) -> None:
-        """Send no more requests."""
+        """Stop sending requests."""
 
 
 class Operator(RigRequests, LiveRequests, MergeRequests, MeasureRequests, ImportRequests):
     """The wizard: requests in, snapshots out. Close it, or use it in a `with` block."""
 
     def __init__(self, session: Path | str | None = None, rig: Choice | None = None, *, set_up: SetUp = set_up) -> None:
-        """Opens or creates `session`, with `rig`, by default the one that the session remembers."""
+        """Open or create `session`, with `rig`, by default the one that the session remembers."""
         self._engine = Engine(set_up, self.capture_pose)
         self._autopilot: AutopilotLike | None = None
         self._surfaces = Surfaces()
@@ -50,9 +51,11 @@ class Operator(RigRequests, LiveRequests, MergeRequests, MeasureRequests, Import
             self.choose_rig(rig)
 
     def __enter__(self) -> "Operator":
+        """Return the operator itself."""
         return self
 
     def __exit__(self, *_: object) -> None:
+        """Close the operator."""
         self.close()
 
     @property
@@ -61,36 +64,39 @@ class Operator(RigRequests, LiveRequests, MergeRequests, MeasureRequests, Import
         return self._engine.session
 
     def snapshot(self) -> Snapshot:
-        """The latest snapshot."""
+        """Return the latest snapshot."""
         return self._engine.publisher.latest
 
     def preview(self) -> PreviewView | None:
-        """The latest preview; None until there is one."""
+        """Return the latest preview; None until there is one."""
         return self._engine.preview
 
     def subscribe(
         self, callback: Callable[[Snapshot], None], preview: Callable[[PreviewView], None] | None = None
     ) -> Callable[[], None]:
-        """Call back with every new snapshot, and with every preview, each always on the same thread; returns a function
-        that ends this. A callback must return soon, and must not wait for another snapshot.
+        """Call back with every new snapshot, and with every preview, each always on the same thread.
+
+        Returns a function that unsubscribes. A callback must return soon, and must not wait for another snapshot.
         """
         removals = [self._engine.publisher.listeners.add(callback)]
         if preview is not None:
             removals.append(self._engine.preview_listeners.add(preview))
 
         def stop() -> None:
+            """Remove the callbacks."""
             for remove in removals:
                 remove()
 
         return stop
 
     def wait_for(self, condition: Callable[[Snapshot], bool], timeout_s: float) -> Snapshot | None:
-        """The first snapshot for which `condition` holds; None after `timeout_s` without one."""
+        """Wait for the first snapshot for which `condition` holds, and return it; None after `timeout_s`."""
         return self._engine.publisher.wait_for(condition, timeout_s)
 
     def wait_until_idle(self, timeout_s: float = 60.0) -> Snapshot:
-        """The snapshot after all requested captures and jobs, with the next pose computed. Raises SlviewerError after
-        `timeout_s`.
+        """Wait until all captures, jobs and the plan of the next pose are complete; returns the snapshot.
+
+        Raises SlviewerError after `timeout_s`.
         """
         engine, end = self._engine, time.monotonic() + timeout_s
         while True:
@@ -117,7 +123,7 @@ class Operator(RigRequests, LiveRequests, MergeRequests, MeasureRequests, Import
 
     @request("Starting autopilot")
     def start_autopilot(self, autopilot: AutopilotLike) -> None:
-        """Let an autopilot send the requests, until it is done or `cancel` stops it."""
+        """Start an autopilot, which sends requests until it is done or `cancel` stops it."""
         with self._engine.lock:
             if self._autopilot is not None and self._autopilot.running:
                 raise InputError("an autopilot is running already: cancel it first")
@@ -125,11 +131,11 @@ class Operator(RigRequests, LiveRequests, MergeRequests, MeasureRequests, Import
             autopilot.start()
 
     def set_autopilot_status(self, act: str) -> None:
-        """Show in the snapshot what the autopilot does now; empty when it has ended."""
+        """Set the autopilot's current act, which the snapshot shows; empty when it has ended."""
         self._engine.set_autopilot(act)
 
     def notify(self, level: Level, text: str) -> None:
-        """Add a sentence of the caller's own to the notices."""
+        """Add a notice of the caller's own."""
         self._engine.notices.add(level, text)
 
     def close(self) -> None:
@@ -140,4 +146,5 @@ class Operator(RigRequests, LiveRequests, MergeRequests, MeasureRequests, Import
 
 
 def _is_planning(snapshot: Snapshot) -> bool:
+    """Whether the plan of the next pose is still being computed."""
     return snapshot.session is not None and snapshot.session.pending_plan is not None

@@ -13,7 +13,7 @@ MOST_PLANS = 8
 
 
 class Planner:
-    """The best plan at any time. `changed()` is called, on the planner's thread, when a better one is ready.
+    """Provides the best plan available; `changed()` is called, on the planner's thread, when a better one is ready.
 
     Only the latest request is computed. `compute` and `quick` are `plan` and `quick_plan`.
     """
@@ -30,10 +30,10 @@ class Planner:
         self._latest: tuple[PlanInput, PosePlan] | None = None  # the last one that was computed and looked up
         self._interim: tuple[object, PosePlan] | None = None
         self._requested: object = None
-        self._worker = LatestWorker("slviewer planner", self._work)
+        self._worker = LatestWorker("slviewer planner", self._compute_plan)
 
     def look_up(self, given: PlanInput) -> tuple[PosePlan, bool]:
-        """(the best plan now, whether it is final). One that is not final is improved by `request`.
+        """Return (the best plan available, whether it is final). One that is not final is improved by `request`.
 
         Until then its poses are those of the last final plan for the same board and devices, and its
         suggestion and sigma are that plan's as long as poses were only added.
@@ -47,7 +47,7 @@ class Planner:
                 return self._interim[1], False
             latest = self._latest
         if not given.takes_time:
-            return self._add(given, self._compute(given)), True
+            return self._cache_plan(given, self._compute(given)), True
         before, grown = None, False
         if latest is not None and latest[0].rig_key == given.rig_key:
             same = {name for name, _ in {*latest[0].hashes} & {*given.hashes}}
@@ -61,7 +61,7 @@ class Planner:
         return interim, False
 
     def request(self, given: PlanInput) -> None:
-        """Compute the plan for this input, instead of any requested before; nothing happens where it is under way."""
+        """Compute the plan for this input in the background, in place of an earlier request."""
         with self._lock:
             if self._requested == given.key or given.key in self._plans:
                 return
@@ -72,7 +72,8 @@ class Planner:
         """End the thread."""
         self._worker.close()
 
-    def _work(self, given: PlanInput) -> None:
+    def _compute_plan(self, given: PlanInput) -> None:
+        """Compute the requested plan on the planner's thread and store it; an interim plan where computing fails."""
         if given.key != self._requested:
             return
         try:
@@ -80,10 +81,11 @@ class Planner:
         except Exception:  # the operator can go on without a suggestion
             log.exception("the next pose could not be computed")
             computed = self.look_up(given)[0]
-        self._add(given, computed)
+        self._cache_plan(given, computed)
         self._changed()
 
-    def _add(self, given: PlanInput, computed: PosePlan) -> PosePlan:
+    def _cache_plan(self, given: PlanInput, computed: PosePlan) -> PosePlan:
+        """Cache a final plan under its input's key, dropping the oldest where the cache is full; returns it."""
         with self._lock:
             while len(self._plans) >= MOST_PLANS:
                 self._plans.pop(next(iter(self._plans)))

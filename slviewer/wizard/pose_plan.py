@@ -33,8 +33,10 @@ from slviewer.target.board import Board
 
 @dataclass(frozen=True, eq=False)
 class PoseFeatures:
-    """What was read of one pose: points (n, 3) mm on the board, camera and projector (n, 2) px, and the noise of the
-    projector's coordinates on bright places, px (NaN: unknown)."""
+    """Features of one pose: `points` (n, 3) mm on the board, their `camera` and `projector` (n, 2) px.
+
+    `noise_px`: noise of the projector's coordinates on bright places, px (NaN: unknown).
+    """
 
     points: np.ndarray
     camera: np.ndarray
@@ -44,10 +46,12 @@ class PoseFeatures:
 
 @dataclass(frozen=True, eq=False)
 class PlanInput:
-    """What a plan depends on: the board, the sizes (width, height) px of both devices, the features of each pose that
-    counts, a stereo calibration (None: none that can be used), the lens's nominal focal length px, and how many poses
-    were refused (as many suggestions were tried in vain and are passed over). `hashes`: {pose: hash of its frames}, and
-    that of the calibration under an empty name; equal inputs have equal `key`."""
+    """Input of a plan: the board, the sizes (width, height) px of both devices, the features of each pose that counts.
+
+    `stereo`: calibration (None: none that can be used). `focal_px`: the lens's nominal focal length. `refused`: number
+    of refused poses (as many suggestions failed and are passed over). `hashes`: {pose: hash of its frames}, and that of
+    the calibration under an empty name; equal inputs have equal `key`.
+    """
 
     board: Board
     camera: tuple[int, int]
@@ -60,25 +64,26 @@ class PlanInput:
 
     @cached_property
     def rig_key(self) -> tuple[object, ...]:
-        """Equal for inputs of the same board and devices."""
+        """Hashable key of board and devices only."""
         return str(self.board), self.camera, self.projector
 
     @cached_property
     def key(self) -> tuple[object, ...]:
+        """Hashable key of the input: equal where board, devices, poses, calibration and focal length are."""
         return *self.rig_key, self.hashes, self.focal_px, self.refused
 
     @cached_property
     def calibrated(self) -> StereoModel | None:
-        """The calibration, if it is one of this camera."""
+        """The stereo calibration, if its camera has this size; else None."""
         return self.stereo if self.stereo is not None and self.stereo.rig.camera.size == self.camera else None
 
     @property
     def takes_time(self) -> bool:
-        """Whether `plan` evaluates a rig's information matrix, rather than what the poses cover."""
+        """Whether `plan` evaluates a rig's information matrix (slow), rather than coverage alone."""
         return self.calibrated is not None or len(self.features) >= MIN_POSES_FOR_RIG
 
     def initial_lens(self) -> Lens:
-        """The nominal lens, else one estimated from the features."""
+        """Return the nominal lens, else one estimated from the features."""
         if self.focal_px is not None:
             return nominal_lens(self.camera, self.focal_px)
         poses = self.features.values()
@@ -94,7 +99,7 @@ MIN_POSES = 8
 
 @dataclass(frozen=True, eq=False)
 class PosePlan:
-    """Poses as far as they are known, what they cover, and what should come next.
+    """Known poses, what they cover, and the suggestion for the next one.
 
     ``sigma_mm``: the 3D standard deviation that a calibration from these poses is predicted to have over the working
     volume (RMS), None before the rig is known well enough; ``sigma_next_mm``: with the suggested pose added.
@@ -110,12 +115,12 @@ class PosePlan:
     sigma_next_mm: float | None = None
 
     def reaches(self, wanted_mm: float) -> bool:
-        """Whether a sigma is reached and no further pose is needed."""
+        """Whether the predicted sigma is at most `wanted_mm` and there are at least `MIN_POSES` poses."""
         return self.sigma_mm is not None and self.sigma_mm <= wanted_mm and len(self.poses) >= MIN_POSES
 
 
 def plan(given: PlanInput) -> PosePlan:
-    """The plan after the poses of `given`. The rig is the calibrated one, else one estimated from the poses."""
+    """Plan the next pose by information gain. The rig is the calibrated one, else one estimated from the poses."""
     poses = list(given.features.values())
     if given.calibrated is not None:
         rig, known = given.calibrated.rig, given.calibrated.poses
@@ -125,9 +130,9 @@ def plan(given: PlanInput) -> PosePlan:
             (given.camera, given.projector),
         )  # fmt: skip
         if rough is None:
-            return _spread_poses(given, given.initial_lens(), {})
+            return _plan_by_coverage(given, given.initial_lens(), {})
         rig, known = rough[0], dict(zip(given.features, rough[1], strict=True))
-    spread = _spread_poses(given, rig.camera, known)
+    spread = _plan_by_coverage(given, rig.camera, known)
     expected = ExpectedNoise().with_noise(np.array([f.noise_px for f in poses]) / given.projector[0])
     try:
         guidance = suggest_poses(GuidanceModel(rig, given.board, expected), list(spread.poses.values()))
@@ -145,17 +150,19 @@ def plan(given: PlanInput) -> PosePlan:
 
 
 def quick_plan(given: PlanInput, before: PosePlan | None) -> PosePlan:
-    """As `plan`, in a few milliseconds: poses by the calibration or by the lens of the plan `before`, and a suggestion
-    by what they cover."""
+    """Plan the next pose by coverage alone, in a few milliseconds.
+
+    Poses come from the calibration, else from the lens of the plan `before`, else from the initial lens.
+    """
     if given.calibrated is not None:
-        return _spread_poses(given, given.calibrated.rig.camera, given.calibrated.poses)
+        return _plan_by_coverage(given, given.calibrated.rig.camera, given.calibrated.poses)
     if before is not None:
-        return _spread_poses(given, before.lens, before.poses)
-    return _spread_poses(given, given.initial_lens(), {})
+        return _plan_by_coverage(given, before.lens, before.poses)
+    return _plan_by_coverage(given, given.initial_lens(), {})
 
 
-def _spread_poses(given: PlanInput, lens: Lens, known: Mapping[str, np.ndarray]) -> PosePlan:
-    """The plan that suggests what poses cover least; poses that are not `known` are placed by the lens."""
+def _plan_by_coverage(given: PlanInput, lens: Lens, known: Mapping[str, np.ndarray]) -> PosePlan:
+    """Plan the next pose by coverage; poses (4, 4) that are not `known` are estimated with the lens."""
     poses = {}
     for name, one in given.features.items():
         T = known[name] if name in known else approximate_pose(one.points, one.camera, lens)

@@ -35,14 +35,14 @@ _REST = 2.0  # pause after a detection, as a multiple of its duration: a third o
 
 @dataclass(frozen=True)
 class Watch:
-    """What to detect: no board where None; `lens` gives its approximate pose."""
+    """What to detect in previews: no board where None; `lens` gives its approximate pose."""
 
     board: Board | None = None
     lens: Lens | None = None
 
 
 class LatestWorker(Generic[Item]):
-    """A thread that calls `work(item)` for the latest item offered, and drops those that came before."""
+    """A thread that calls `work(item)` with the latest item offered, and drops earlier ones."""
 
     def __init__(self, name: str, work: Callable[[Item], None], rest: float = 0.0) -> None:
         self._work, self._rest = work, rest
@@ -53,7 +53,7 @@ class LatestWorker(Generic[Item]):
         self._thread.start()
 
     def offer(self, item: Item) -> None:
-        """Work on this next, instead of any that is still waiting."""
+        """Set the next item, in place of one that is still waiting."""
         with self._condition:
             self._item = item
             self._condition.notify_all()
@@ -66,6 +66,7 @@ class LatestWorker(Generic[Item]):
         self._thread.join(2.0)
 
     def _serve(self) -> None:
+        """Process the latest item until closing, pausing `rest` times its duration; failures are logged."""
         while True:
             with self._condition:
                 self._condition.wait_for(lambda: self._closing or self._item is not None)
@@ -83,7 +84,7 @@ class LatestWorker(Generic[Item]):
 
 
 class Watcher:
-    """Analyses frames; `analysed(view)` is called, on one thread, after each."""
+    """Analyses preview frames; `analysed(view)` is called after each, on one thread."""
 
     def __init__(self, analysed: Callable[[PreviewView], None]) -> None:
         self._analysed = analysed
@@ -99,7 +100,7 @@ class Watcher:
         self._viewer.offer(frame)
 
     def watch(self, target: Watch) -> None:
-        """Detect another board from now on."""
+        """Set the board to detect from now on."""
         self._watch = target
 
     def close(self) -> None:
@@ -108,6 +109,7 @@ class Watcher:
         self._detector.close()
 
     def _make_preview(self, frame: np.ndarray) -> None:
+        """Reduce a frame (h, w), offer it for board detection, and publish a preview with the latest detection."""
         now = time.monotonic()
         image, scale = reduced(frame)
         if self._watch.board is not None:
@@ -123,6 +125,7 @@ class Watcher:
         self._analysed(PreviewView(self._number, image, scale, *brightness(frame), board, missing, None, rate))
 
     def _detect(self, item: tuple[np.ndarray, float, float]) -> None:
+        """Detect the board in (reduced image, its scale, time in s), and store it, or why there is none."""
         image, scale, time_s = item
         watch, board = self._watch, None
         detection, missing = detect_board(watch.board, image)
@@ -137,33 +140,33 @@ class Watcher:
 
 
 class Stillness:
-    """For how long features have not moved."""
+    """Measures for how long detected features have not moved."""
 
     def __init__(self) -> None:
         self._pixels: np.ndarray | None = None
         self._since = 0.0
 
     def update(self, pixels: np.ndarray, tolerance_px: float, now: float) -> float:
-        """Seconds since the features (n, 2) px last moved further than `tolerance_px` from where they came to rest."""
+        """Return the seconds since features (n, 2) px last moved more than `tolerance_px` from their rest position."""
         before = self._pixels
         if before is None or before.shape != pixels.shape or np.abs(pixels - before).max() > tolerance_px:
             self._pixels, self._since = pixels, now
         return now - self._since
 
     def reset(self) -> None:
-        """The board is no longer seen."""
+        """Forget the features: the board is no longer detected."""
         self._pixels = None
 
 
 def reduced(frame: np.ndarray) -> tuple[np.ndarray, float]:
-    """(the frame (h, w) as uint8, SEARCH_PX long at most; its scale)."""
+    """Reduce a frame (h, w) to uint8 with at most SEARCH_PX on its longer side; returns (image, scale)."""
     scale = min(1.0, SEARCH_PX / max(frame.shape))
     small = cv2.resize(frame, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else frame
     return to_eight_bits(small, int(frame.max(initial=0))), scale
 
 
 def brightness(frame: np.ndarray) -> tuple[float, float, np.ndarray]:
-    """(share of saturated pixels, 99.5th percentile as a share of the range, histogram (64,) of shares)."""
+    """Return (share of saturated pixels, 99.5th percentile as a share of the range, histogram (64,) of shares)."""
     top = clip_level(frame.dtype, int(frame.max(initial=0)))
     some = frame[:: max(1, frame.shape[0] // 400), :: max(1, frame.shape[1] // 400)]
     counts = np.histogram(some, BINS, (0, top + 1))[0]
@@ -171,7 +174,7 @@ def brightness(frame: np.ndarray) -> tuple[float, float, np.ndarray]:
 
 
 def detect_board(board: Board | None, image: np.ndarray) -> tuple[Detection | None, str]:
-    """The board in a reduced image, or why there is none."""
+    """Detect the board in a reduced image; returns (detection, "") or (None, why it was not detected)."""
     if board is None:
         return None, ""
     try:
@@ -183,7 +186,7 @@ def detect_board(board: Board | None, image: np.ndarray) -> tuple[Detection | No
 def observe_board(
     board: Board, detection: Detection, still_s: float, lens: Lens | None, time_s: float
 ) -> BoardSeen | None:
-    """The detected board as a panel draws it."""
+    """Return the detected board for display: outline (4, 2) px, approximate pose; None with fewer than 4 features."""
     points = board.points[detection.ids]
     if len(points) < 4:
         return None
@@ -193,7 +196,7 @@ def observe_board(
 
 
 class HandsFree:
-    """Decides when to capture without a key: when the board is held still for a while in a new place."""
+    """Decides when to capture hands-free: once the board was held still for a while in a new place."""
 
     HOLD_S = 1.0
     COUNT_S = 1.0
@@ -205,11 +208,11 @@ class HandsFree:
         self._begun: float | None = None
 
     def switch(self, on: bool) -> None:
-        """Switch it on or off."""
+        """Switch hands-free capture on or off."""
         self.is_on = on
 
     def countdown(self, board: BoardSeen | None, busy: bool, now: float) -> float | None:
-        """Seconds until the capture, 0 or less: now; None where none is coming."""
+        """Return the seconds until the capture, 0 or less when it is due; None where none is coming."""
         if self._requested is not None and not busy and board is not None and board.time_s > self._requested:
             self._captured, self._requested = board.outline, None
         held = self.is_on and self._requested is None and board is not None and not busy
@@ -221,10 +224,11 @@ class HandsFree:
         return self.COUNT_S - (now - self._begun)
 
     def note_capture(self) -> None:
-        """A capture was requested, by whatever means; the next image of the board shows where it was taken."""
+        """Note that a capture was requested; the board's outline in the next preview is then the captured place."""
         self._requested, self._begun = time.monotonic(), None
 
     def _is_captured(self, outline: np.ndarray) -> bool:
+        """Whether the outline (4, 2) px is within 3 % of the board's size of the last captured one."""
         if self._captured is None:
             return False
         size = np.linalg.norm(np.ptp(outline, axis=0))

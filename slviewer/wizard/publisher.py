@@ -16,16 +16,17 @@ Item = TypeVar("Item")
 
 
 class Listeners(Generic[Item]):
-    """Callbacks that are all called by one thread; they may be added and removed by any."""
+    """Callbacks, all called by one thread; they may be added and removed by any."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._callbacks: tuple[Callable[[Item], None], ...] = ()
 
     def add(self, callback: Callable[[Item], None]) -> Callable[[], None]:
-        """Call back with every item from now on; returns a function that ends this."""
+        """Add a callback for every later item; returns a function that removes it."""
 
         def remove() -> None:
+            """Remove the callback."""
             with self._lock:
                 self._callbacks = tuple(each for each in self._callbacks if each is not callback)
 
@@ -34,7 +35,7 @@ class Listeners(Generic[Item]):
         return remove
 
     def call(self, item: Item) -> None:
-        """Call all of them; a callback that fails is logged, and the others are called all the same."""
+        """Call every callback with the item; one that fails is logged."""
         for callback in self._callbacks:
             try:
                 callback(item)
@@ -58,7 +59,7 @@ class Publisher:
         self.listeners = Listeners[Snapshot]()
 
     def start(self) -> None:
-        """Begin to build snapshots, once everything exists that `build` reads."""
+        """Start the publisher's thread, once everything exists that `build` reads."""
         self._thread.start()
 
     def mark_changed(self, session: bool = False) -> None:
@@ -69,7 +70,7 @@ class Publisher:
             self._condition.notify_all()
 
     def refresh(self) -> Snapshot:
-        """A snapshot of this moment, published to every listener. Not to be called by a listener."""
+        """Build and publish a new snapshot now, and return it. Not to be called by a listener."""
         self.mark_changed(session=True)
         with self._condition:
             wanted, self._urgent = self._requested, True
@@ -79,12 +80,12 @@ class Publisher:
 
     @property
     def is_current(self) -> bool:
-        """Whether the latest snapshot shows every change, and every listener has been called with it."""
+        """Whether the latest snapshot contains every change, and every listener has been called with it."""
         with self._condition:
             return self._requested == self._published
 
     def wait_for(self, condition: Callable[[Snapshot], bool], timeout_s: float) -> Snapshot | None:
-        """The first snapshot for which `condition` holds; None after `timeout_s` without one."""
+        """Wait for the first snapshot for which `condition` holds, and return it; None after `timeout_s`."""
         end = time.monotonic() + timeout_s
         with self._condition:
             while not condition(self.latest):
@@ -102,6 +103,7 @@ class Publisher:
         self._thread.join(5.0)
 
     def _serve(self) -> None:
+        """Build and publish a snapshot after each batch of changes until closing; a failed build is logged."""
         while True:
             with self._condition:
                 self._condition.wait_for(lambda: self._requested > self._published or self._closing)

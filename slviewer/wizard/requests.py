@@ -11,11 +11,12 @@ T = TypeVar("T")
 
 
 class RequestHandler:
-    """Handles requests to an engine: what every group of requests shares."""
+    """Base of all groups of requests to an engine."""
 
     _engine: Engine
 
     def _warn(self, text: str) -> None:
+        """Add a warning to the notices."""
         self._engine.notices.add("warning", text)
 
     def _submit(
@@ -28,6 +29,7 @@ class RequestHandler:
         """Queue a job; `describe(result)` becomes a notice, and `failed(error)` replaces the notice of a failure."""
 
         def done(result: T) -> None:
+            """Add the description of the result to the notices, and mark the session as changed."""
             self._engine.notices.add("good", describe(result))
             self._engine.publisher.mark_changed(session=True)
 
@@ -40,11 +42,14 @@ Request = Callable[Concatenate[Any, P], bool]
 
 
 def request(action: str) -> Callable[[Callable[Concatenate[Handler, P], None]], Request[P]]:
-    """Decorates a method: it then returns whether the request was granted, and a refusal becomes a notice."""
+    """Return a decorator: the method then returns whether its request was granted, and an error becomes a notice."""
 
     def decorate(function: Callable[Concatenate[Handler, P], None]) -> Request[P]:
+        """Wrap a method as a request."""
+
         @wraps(function)
         def handle(self: Handler, /, *args: P.args, **kwargs: P.kwargs) -> bool:
+            """Call the method; return True, or False with a notice where it raised an error."""
             try:
                 function(self, *args, **kwargs)
             except Exception as error:

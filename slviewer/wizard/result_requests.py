@@ -15,7 +15,7 @@ from slviewer.wizard.requests import RequestHandler, request
 
 
 class ResultRequests(RequestHandler):
-    """What the worker computes from captures, and decisions about poses, scans and models."""
+    """Requests that compute results from captures, and decisions about poses, scans and models."""
 
     @request("Excluding the pose")
     def exclude(self, name: str, why: str = "by hand") -> None:
@@ -44,7 +44,7 @@ class ResultRequests(RequestHandler):
 
     @request("Renaming")
     def rename(self, name: str, label: str) -> None:
-        """Give a capture a label, any text; its files keep their name."""
+        """Set the label of a capture, any text; its files keep their name."""
         store = self._engine.store
         store.load_capture(name)
         store.decide("names", {**(store.decision("names") or {}), name: label.strip() or name})
@@ -58,10 +58,12 @@ class ResultRequests(RequestHandler):
         calibrate = partial(tasks.calibrate_session, engine.store, target, warn=self._warn)
 
         def done(result: CalibrationResult) -> None:
+            """Report the result of the calibration, and mark the session as changed."""
             engine.notices.add(*tasks.describe_calibration(result))
             engine.publisher.mark_changed(session=True)
 
         def failed(error: BaseException) -> None:
+            """Report why the calibration failed, and mark the session as changed."""
             engine.notices.add_failure("Calibrating", error)
             engine.publisher.mark_changed(session=True)  # a rejected calibration is saved, to be inspected
 
@@ -69,13 +71,13 @@ class ResultRequests(RequestHandler):
 
     @request("Comparing the models")
     def compare_models(self) -> None:
-        """Measure each target pose by calibrations made without it; the best model is then recommended, and used."""
+        """Cross-validate the models on the target poses; the best one is then recommended, and used."""
         compare = partial(tasks.compare_models, self._engine.store, warn=self._warn)
         self._submit("Comparing the models", compare, tasks.describe_comparison)
 
     @request("Choosing the model")
     def choose_model(self, name: str) -> None:
-        """Use this model from now on; empty: the recommended one."""
+        """Set the model that later steps use; empty: the recommended one."""
         store = self._engine.store
         if name and name not in (models := available_models(store)):
             raise InputError(f"the session has no {name} calibration: choose one of {', '.join(models)}")
@@ -83,12 +85,12 @@ class ResultRequests(RequestHandler):
 
     @request("Using the rejected calibration")
     def accept_rejected_calibration(self, on: bool) -> None:
-        """Use the current calibration although it was rejected, or no longer do."""
+        """Allow or forbid using the current calibration although it was rejected."""
         accept_rejected_calibration(self._engine.store, on)
 
     @request("Verifying")
     def verify(self, names: Sequence[str], shape: Shape, radius_mm: float | None = None) -> None:
-        """Compare the models on captures of a plane or a sphere; a rough `radius_mm` helps to detect a sphere."""
+        """Compare the models on captures of a plane or a sphere; `radius_mm` helps to detect a sphere."""
         store = self._engine.store
         chosen = [store.load_capture(name).name for name in names]
         verify = partial(tasks.verify_captures, store, chosen, shape, radius_mm, warn=self._warn)
@@ -96,7 +98,7 @@ class ResultRequests(RequestHandler):
 
     @request("Reconstructing")
     def reconstruct(self, name: str, model: str | None = None) -> None:
-        """Reconstruct a capture, by the best model unless one is named."""
+        """Reconstruct a capture, with the best model unless one is named."""
         store = self._engine.store
         store.load_capture(name)
         reconstruct = partial(tasks.reconstruct_capture, store, name, model, warn=self._warn)

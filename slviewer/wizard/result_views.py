@@ -46,14 +46,16 @@ class ScanCloud:
     sigma_edges: np.ndarray | None = None
 
     def nearest(self, origin: np.ndarray, direction: np.ndarray) -> tuple[int, int] | None:
-        """(u, v) of the measured pixel closest to a ray (camera frame, mm), within 1 % of its depth; None if none."""
+        """Return (u, v) of the measured pixel closest to a ray (camera frame, mm); None if none is near."""
         index = nearest(self.points, origin, direction)
         return None if index is None else (index[1], index[0])
 
 
 def nearest(points: np.ndarray, origin: np.ndarray, direction: np.ndarray) -> tuple[int, ...] | None:
-    """Index of the point of (..., 3), NaN where none is, that is closest to a ray, within 1 % of its depth, the front
-    before the back; None where there is none."""
+    """Return the index of the point (..., 3) closest to a ray, within 1 % of its depth, the front before the back.
+
+    None where there is none; NaN points are ignored.
+    """
     ways = points - origin
     along = ways @ (direction / np.linalg.norm(direction))
     off = np.sqrt(np.maximum((ways**2).sum(-1) - along**2, 0))
@@ -64,25 +66,25 @@ def nearest(points: np.ndarray, origin: np.ndarray, direction: np.ndarray) -> tu
 
 
 def scan_cloud(session: Session, name: str) -> ScanCloud:
-    """The cloud that was reconstructed of a capture. Raises InputError where it was not."""
+    """Load the reconstructed cloud of a capture. Raises InputError where it was not reconstructed."""
     meta, arrays = session.load_result(f"clouds/{name}")
     errors = error_maps(session, name) if f"verify/{name}" in session.result_names() else {}
     return ScanCloud(name=name, model=meta["model"], axis=meta["axis"], errors=errors, **arrays)
 
 
 def error_maps(session: Session, name: str) -> dict[str, np.ndarray]:
-    """{model: (h, w) float32 mm} signed distances from the plane or sphere that was fitted, NaN where not measured."""
+    """Load {model: (h, w) float32 mm} signed distances from the fitted plane or sphere, NaN where not measured."""
     arrays = session.load_result(f"verify/{name}")[1]
     return {key.removeprefix("error_"): array for key, array in arrays.items()}
 
 
 def merged_cloud(session: Session, name: str) -> Ply:
-    """The merged points of a merge."""
+    """Load the merged points of a merge."""
     return read_ply(session.exports / str(session.load_result(f"merge/{name}", only=())[0]["ply"]))
 
 
 def merge_view(name: str, meta: Mapping[str, Any], stale: bool) -> MergeView:
-    """The view of a saved merge; files of older versions lack some of it."""
+    """Convert the `meta` of a saved merge to its view; files of older versions lack some fields."""
     pairs = meta["pairs"]
     onto = [{"scan": scan, "onto": meta["reference"], **pair} for scan, pair in pairs.items()]
     stray: Counter[str] = Counter()
@@ -97,7 +99,7 @@ def merge_view(name: str, meta: Mapping[str, Any], stale: bool) -> MergeView:
             scan: (pair["rms_mm"], pair["overlap"], np.array(pair["T_reference_scan"])) for scan, pair in pairs.items()
         },
         stale=stale,
-        registered=tuple(_merged_pair(pair) for pair in meta.get("registered", onto)),
+        registered=tuple(_read_merged_pair(pair) for pair in meta.get("registered", onto)),
         loops=tuple(
             MergedLoop(tuple(loop["scans"]), *(loop[key] for key in ("error_mm", "error_deg", "left_mm", "left_deg")))
             for loop in meta.get("loops", ())
@@ -109,7 +111,8 @@ def merge_view(name: str, meta: Mapping[str, Any], stale: bool) -> MergeView:
     )
 
 
-def _merged_pair(pair: Mapping[str, Any]) -> MergedPair:
+def _read_merged_pair(pair: Mapping[str, Any]) -> MergedPair:
+    """Convert a saved pair alignment to its view, with the overlap centre's shift in mm and the rotation in degrees."""
     T = np.array(pair["T_reference_scan"])
     moved = None
     if "middle" in pair:
@@ -129,14 +132,14 @@ def _merged_pair(pair: Mapping[str, Any]) -> MergedPair:
 
 
 def pixel_fits(session: Session) -> Mapping[Axis, PixelFit]:
-    """The pixel-wise fits by axis: RMS maps, poses, coefficients."""
+    """Load the pixel-wise fits by axis: RMS maps, poses, coefficients."""
     model = load_model(session, "pixelwise")
     assert isinstance(model, PixelwiseModel)
     return model.fits
 
 
 def pixel_curve(session: Session, pixel: tuple[int, int], axis: Axis) -> PixelCurve | None:
-    """Data and fit of z-phi, x-z, y-z at a pixel (u, v); None where it was not fitted."""
+    """Return the data and fit of z-phi, x-z, y-z at a pixel (u, v); None where it was not fitted."""
     model = load_model(session, "pixelwise")
     stereo = load_stereo(session)
     assert isinstance(model, PixelwiseModel)
@@ -149,7 +152,7 @@ def pixel_curve(session: Session, pixel: tuple[int, int], axis: Axis) -> PixelCu
 
 
 def thumbnail(capture: Capture) -> bytes:
-    """A small JPEG of the capture's texture, or of its brightest kind of frame where it has none."""
+    """Return a small JPEG of the capture's texture, or of its brightest kind of frame where it has none."""
     order = ("texture", "white", "phase", "gray")
     frames = capture.sequence.frames
     index = min(range(len(frames)), key=lambda k: order.index(frames[k].kind) if frames[k].kind in order else 9)

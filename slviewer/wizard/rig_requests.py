@@ -29,7 +29,7 @@ _CHECKED: dict[CheckVerdict, tuple[Level, str]] = {
 
 
 class RigRequests(RequestHandler):
-    """The session, the devices, the target and the patterns."""
+    """Requests about the session, the devices, the target and the patterns."""
 
     @request("Opening the session")
     def open_session(self, path: Path | str, rig: Choice | None = None) -> None:
@@ -62,7 +62,7 @@ class RigRequests(RequestHandler):
 
     @request("Setting the exposures")
     def set_exposures(self, exposures_ms: Sequence[float]) -> None:
-        """Take every capture in several exposures, for shiny and dark parts; empty: in a single one."""
+        """Set several exposures, ms, for every capture, for shiny and dark parts; empty: a single one."""
         self._engine.store.decide("exposures", check_exposures(exposures_ms) if exposures_ms else [])
 
     @request("Checking the rig")
@@ -71,6 +71,7 @@ class RigRequests(RequestHandler):
         engine, bench = self._engine, self._engine.bench
 
         def done(result: Preflight) -> None:
+            """Store the result of the check, and report its verdict, if the rig is still in use."""
             if engine.set_preflight(bench, result):
                 engine.notices.add(*_CHECKED[result.verdict])
 
@@ -78,7 +79,7 @@ class RigRequests(RequestHandler):
 
     @request("Linearising the projector")
     def set_linear_light(self, on: bool) -> None:
-        """Project through the table of grey levels that the check of the rig has measured, or without it."""
+        """Switch the projector's linearisation, by the table of grey levels from the rig check, on or off."""
         levels = self._engine.preflight.levels if self._engine.preflight else None
         if on and levels is None:
             raise InputError("no table of grey levels is measured: check the rig first")
@@ -101,7 +102,7 @@ class RigRequests(RequestHandler):
 
     @request("Choosing the target")
     def choose_target(self, notation: str) -> None:
-        """Set the board; poses captured before are judged again by it."""
+        """Set the board; poses captured before are evaluated again with it."""
         board, engine = Board.parse(notation), self._engine
         with engine.lock:
             before = engine.reader.target()
@@ -121,15 +122,17 @@ class RigRequests(RequestHandler):
 
     @request("Setting the wanted accuracy")
     def set_wanted_sigma(self, sigma_mm: float | None) -> None:
-        """Suggest poses until a calibration is predicted to have this 3D standard deviation, mm; None: the default."""
+        """Set the 3D standard deviation, mm, that the suggested poses aim for; None: the default."""
         if sigma_mm is not None and not 0 < sigma_mm < 100:
             raise InputError(f"a standard deviation of {sigma_mm:g} mm is not possible: give one above 0 mm")
         self._engine.store.decide("sigma_wanted_mm", sigma_mm)
 
     @request("Placing")
     def place(self, thing: Thing, T_camera_object: np.ndarray | None = None) -> None:
-        """Put "board", "plane", "sphere" or "object" before the simulated rig, at T_camera_object (4, 4) mm or where
-        it was."""
+        """Place "board", "plane", "sphere" or "object" in front of the simulated rig.
+
+        At T_camera_object (4, 4) mm, or where it was.
+        """
         T = None if T_camera_object is None else np.asarray(T_camera_object, float)
         if T is not None and T.shape != (4, 4):
             raise InputError(f"a pose has the shape {T.shape}: give (4, 4)")
@@ -141,7 +144,7 @@ class RigRequests(RequestHandler):
         self._engine.world.move(distance_mm, turn_deg)
 
     def place_at_suggestion(self) -> bool:
-        """Put the simulated board where the next pose is suggested."""
+        """Place the simulated board at the suggested next pose; False, with a notice, where none is suggested."""
         session = self._engine.publisher.refresh().session
         if session is None or session.suggestion is None:
             self._engine.notices.add("error", "no pose is suggested yet: choose a rig and a target first")

@@ -58,8 +58,11 @@ MOST_CACHED = 500
 
 @dataclass(frozen=True)
 class _Inputs:
-    """What results are compared with to see whether they are stale: captures by name, the operator's labels, hashes of
-    captures and of fresh calibrations, and {model: correction of scale}."""
+    """Current inputs, to detect stale results.
+
+    Captures by name, the operator's labels, hashes of captures and of fresh calibrations, and {model: correction of
+    scale}.
+    """
 
     captures: Mapping[str, Capture]
     labels: Mapping[str, str]
@@ -67,12 +70,14 @@ class _Inputs:
     factors: Mapping[str, float]
 
     def is_fresh(self, meta: Mapping[str, Any]) -> bool:
-        """Whether every input of a result exists with the hash it had, and no scale has changed since."""
-        return not (_differs(meta.get("inputs", {}), self.hashes) or _differs(meta.get("scales", {}), self.factors))
+        """Whether every input of a result still has the hash it was made from, and no scale has changed since."""
+        return not (
+            _has_changed(meta.get("inputs", {}), self.hashes) or _has_changed(meta.get("scales", {}), self.factors)
+        )
 
 
 class SessionReader:
-    """Reads one session again and again, and caches what is slow to read under its content hash."""
+    """Reads one session repeatedly, and caches what is slow to read by its content hash."""
 
     def __init__(self, session: Session, planner: Planner) -> None:
         self.session = session
@@ -88,12 +93,12 @@ class SessionReader:
             self._thumbnails[capture.hash] = jpeg
 
     def add_unreadable(self, capture: Capture, why: str) -> None:
-        """Store why a pose cannot be judged: it would fail again, and the session holds no result."""
+        """Store why a pose cannot be evaluated, so that it is not tried again."""
         with self._lock:
             self._unreadable[capture.hash, self.target()] = why
 
     def target(self) -> str:
-        """The board's notation: as decided, else that of the calibration or of the poses; empty where unknown."""
+        """Return the board's notation: as chosen, else that of the calibration or of the poses; empty where unknown."""
         decided = self.session.decision("target")
         if decided:
             return str(decided)
@@ -103,53 +108,56 @@ class SessionReader:
         return next((str(c.meta["board"]) for c in self.session.captures("calibration") if c.meta.get("board")), "")
 
     def patterns(self) -> str:
-        """The name of the pattern sequence."""
+        """Return the name of the pattern sequence."""
         return str(self.session.decision("patterns") or DEFAULT_PATTERNS)
 
     def has_thumbnail(self, capture: Capture) -> bool:
-        """Whether its thumbnail is stored."""
+        """Whether a thumbnail of the capture is stored."""
         return capture.hash in self._thumbnails
 
     def needs_judging(self, capture: Capture, target: str) -> bool:
-        """Whether this is a pose that was not read with this target yet."""
+        """Whether this is a target pose whose features were not read with this target yet."""
         if capture.role != "calibration" or not target or (capture.hash, target) in self._unreadable:
             return False
-        return self._judgement(capture, target) is None
+        return self._load_judgement(capture, target) is None
 
     def count_frames(self, rig: RigView) -> int | None:
-        """The number of frames of the next pose; None where the projector's size is unknown."""
+        """Return the number of frames of the next pose; None where the projector's size is unknown."""
         if rig.projector is None:
             return None
         patterns, projector = self.patterns(), rig.projector
-        shown = self._cached(("frames", patterns, projector), lambda: len(PRESETS[patterns](projector).frames))
+        shown = self._get_cached(("frames", patterns, projector), lambda: len(PRESETS[patterns](projector).frames))
         return int(shown) * max(1, len(self.exposures_ms()))
 
     def levels(self) -> tuple[int, ...] | None:
-        """The table of grey levels that linearises the projector, where the operator uses it."""
+        """Return the table of grey levels that linearises the projector; None where it is not used."""
         return tuple(int(level) for level in self.session.decision("levels") or ()) or None
 
     def exposures_ms(self) -> tuple[float, ...]:
-        """The exposures of every capture; empty: a single one, the camera's."""
+        """Return the exposures of every capture, ms; empty: a single one, the camera's."""
         return tuple(float(exposure) for exposure in self.session.decision("exposures") or ())
 
     def read(self, rig: RigView, focal_px: float | None) -> SessionView:
-        """The session now. `rig` has the sizes until there are poses; `focal_px` is its lens's nominal focal length."""
+        """Read the session's current state.
+
+        `rig` has the devices' sizes until there are poses, `focal_px` is its lens's nominal focal length.
+        """
         session, target = self.session, self.target()
         captures = {capture.name: capture for capture in session.captures()}
         calibration = self._read_calibration(captures)
         models = calibration.models if calibration else ()
         hashes = {name: capture.hash for name, capture in captures.items()}
         for name in (f"calibration/{model}" for model in models):
-            meta = self._meta(name)
-            if not _differs(meta["inputs"], hashes):
+            meta = self._load_meta(name)
+            if not _has_changed(meta["inputs"], hashes):
                 hashes[name] = meta["hash"]
         factors = {model: scale_factor(session, model) for model in models}
         inputs = _Inputs(captures, session.decision("names") or {}, hashes, factors)
         poses, plan, pending = self._read_poses(captures, target, calibration, rig, focal_px)
         verifications = self._read_verifications(inputs)
         verdict = load_last_verdict(session)
-        of_calibration = calibration is not None and _is_verdict_of(verdict, self._meta("calibration/stereo"))
-        merges = [name for name in self._results("merge/") if set(self._meta(name)["scans"]) <= set(captures)]
+        of_calibration = calibration is not None and _is_verdict_of(verdict, self._load_meta("calibration/stereo"))
+        merges = [name for name in self._list_results("merge/") if set(self._load_meta(name)["scans"]) <= set(captures)]
         return SessionView(
             folder=session.folder,
             target=target,
@@ -178,11 +186,11 @@ class SessionReader:
 
     # poses
 
-    def _judgement(self, capture: Capture, target: str) -> dict[str, Any] | None:
-        """The `meta` of a pose's result, if it is of these frames and this board."""
+    def _load_judgement(self, capture: Capture, target: str) -> dict[str, Any] | None:
+        """Return the `meta` of a pose's result; None unless it was made from these frames and this board."""
         if not self.session.has_result(f"poses/{capture.name}"):
             return None
-        meta = self._meta(f"poses/{capture.name}")
+        meta = self._load_meta(f"poses/{capture.name}")
         return meta if meta["inputs"].get(capture.name) == capture.hash and meta["target"] == target else None
 
     def _read_poses(
@@ -193,10 +201,10 @@ class SessionReader:
         rig: RigView,
         focal_px: float | None,
     ) -> tuple[tuple[PoseView, ...], PosePlan | None, PlanInput | None]:
-        """(the poses, the plan after them, the input of the final plan where this one is interim)."""
+        """Return (the poses, the plan after them, the input of the final plan where this one is interim)."""
         poses = [capture for capture in captures.values() if capture.role == "calibration"]
-        judged = {pose.name: self._judgement(pose, target) if target else None for pose in poses}
-        states = {pose.name: self._state(pose, target, judged[pose.name], calibration) for pose in poses}
+        judged = {pose.name: self._load_judgement(pose, target) if target else None for pose in poses}
+        states = {pose.name: self._determine_pose_state(pose, target, judged[pose.name], calibration) for pose in poses}
         camera, projector = (poses[0].size, poses[0].sequence.projector_size) if poses else (rig.camera, rig.projector)
         plan = given = None
         is_final = True
@@ -209,7 +217,7 @@ class SessionReader:
             stereo = None if calibration is None or calibration.refused else calibration.stereo
             hashes = [(name, captures[name].hash) for name in features]
             if stereo is not None:
-                hashes.append(("", self._meta("calibration/stereo")["hash"]))
+                hashes.append(("", self._load_meta("calibration/stereo")["hash"]))
             refused = sum(state == "refused" for state, _ in states.values())
             given = PlanInput(
                 Board.parse(target), camera, projector, features, stereo, focal_px, refused, tuple(hashes)
@@ -235,9 +243,10 @@ class SessionReader:
             )
         return tuple(views), plan, None if is_final else given
 
-    def _state(
+    def _determine_pose_state(
         self, pose: Capture, target: str, meta: Mapping[str, Any] | None, calibration: CalibrationView | None
     ) -> tuple[PoseState, str]:
+        """Return the state of a target pose and the reason, which is empty where there is none."""
         excluded = self.session.excluded()
         if pose.name in excluded:
             return "excluded", excluded[pose.name]
@@ -248,7 +257,7 @@ class SessionReader:
         if meta["refused"]:
             return "refused", str(meta["refused"])
         if calibration is not None:
-            if self._meta("calibration/stereo").get("inputs", {}).get(pose.name) == pose.hash:
+            if self._load_meta("calibration/stereo").get("inputs", {}).get(pose.name) == pose.hash:
                 return "used", ""
             why = calibration.stereo.excluded.get(pose.name, "")
             if why and not why.startswith("excluded by the operator"):  # such a pose was included again since
@@ -256,7 +265,10 @@ class SessionReader:
         return "good", ""
 
     def _load_features(self, name: str, content_hash: str) -> PoseFeatures:
+        """Load the features of a pose and the median noise of its projector coordinates; cached by content hash."""
+
         def load() -> PoseFeatures:
+            """Load the features from the pose's saved result."""
             names = ("points", "camera", "projector")
             try:
                 arrays = self.session.load_result(f"poses/{name}", only=(*names, "samples_sigma"))[1]
@@ -266,26 +278,27 @@ class SessionReader:
             known = sigma[np.isfinite(sigma)]
             return PoseFeatures(**arrays, noise_px=float(np.median(known)) if known.size else np.nan)
 
-        return self._cached(("features", content_hash), load)  # type: ignore[no-any-return]
+        return self._get_cached(("features", content_hash), load)  # type: ignore[no-any-return]
 
     # calibration
 
     def _read_calibration(self, captures: Mapping[str, Capture]) -> CalibrationView | None:
+        """Read the session's calibration, and what makes it stale; None without a complete stereo model."""
         session = self.session
         models = available_models(session)
         if "stereo" not in models:
             return None
-        hashes = {model: self._meta(f"calibration/{model}")["hash"] for model in models}
+        hashes = {model: self._load_meta(f"calibration/{model}")["hash"] for model in models}
         made_of = ("stereo", hashes["stereo"], tuple(captures)[:1])
-        stereo: StereoModel | None = self._cached(made_of, lambda: load_stereo_if_complete(session))
+        stereo: StereoModel | None = self._get_cached(made_of, lambda: load_stereo_if_complete(session))
         if stereo is None:
             return None
         fit_rms: Mapping[str, Mapping[str, float]] | None = {}
         splined = None
         if "pixelwise" in models:
-            fit_rms = self._cached(("pixelwise", hashes["pixelwise"]), lambda: _load_fit_rms(session))
+            fit_rms = self._get_cached(("pixelwise", hashes["pixelwise"]), lambda: _load_fit_rms(session))
         if "splined" in models:
-            splined = self._cached(("splined", hashes["splined"]), lambda: _load_splined(session))
+            splined = self._get_cached(("splined", hashes["splined"]), lambda: _load_splined(session))
         foreign = ""
         if fit_rms is None or ("splined" in models and splined is None):
             foreign = "it was saved by another version of slviewer: calibrate again"
@@ -293,7 +306,7 @@ class SessionReader:
             stereo=stereo,
             models=models,
             best=preferred_model(session),
-            stale=foreign or self._describe_changes(self._meta("calibration/stereo")["inputs"], captures),
+            stale=foreign or self._describe_changes(self._load_meta("calibration/stereo")["inputs"], captures),
             fit_rms_mm=fit_rms or {},
             recommended=recommended_model(session),
             chosen=str(decided) if (decided := session.decision("model")) in models else "",
@@ -306,7 +319,7 @@ class SessionReader:
         )
 
     def _describe_changes(self, inputs: Mapping[str, str], captures: Mapping[str, Capture]) -> str:
-        """Which poses of a calibration were retaken, deleted or excluded since; empty where none was."""
+        """Describe which poses of a calibration were retaken, deleted or excluded since; empty where none was."""
         excluded = self.session.excluded()
         gone = [n for n, used in inputs.items() if n not in captures or captures[n].hash != used]
         dropped = [n for n in inputs if n in excluded]
@@ -320,16 +333,18 @@ class SessionReader:
     # verifications, scans, merges, measurements
 
     def _read_verifications(self, inputs: _Inputs) -> tuple[VerificationView, ...]:
+        """Read the verifications of existing captures, with whether they are stale."""
         return tuple(
             read_verification(name, meta, str(inputs.labels.get(name, name)), not inputs.is_fresh(meta))
-            for result in self._results("verify/")
+            for result in self._list_results("verify/")
             if (name := result.removeprefix("verify/")) in inputs.captures
-            for meta in (self._meta(result),)
+            for meta in (self._load_meta(result),)
         )
 
     def _read_scan(self, capture: Capture, inputs: _Inputs) -> ScanView:
+        """Return the view of a scan capture: its label, and the figures and staleness of its cloud."""
         result = f"clouds/{capture.name}"
-        meta = self._meta(result) if self.session.has_result(result) else {}
+        meta = self._load_meta(result) if self.session.has_result(result) else {}
         depths = meta.get("depth_mm")
         return ScanView(
             name=capture.name,
@@ -347,22 +362,23 @@ class SessionReader:
         )
 
     def _read_merge(self, result: str, inputs: _Inputs) -> MergeView:
-        meta = self._meta(result)
+        """Read the view of a merge by its result name, with whether it is stale."""
+        meta = self._load_meta(result)
         stale = not inputs.is_fresh(meta)
         name = result.removeprefix("merge/")
-        return self._cached(("merge", meta["hash"], stale), lambda: merge_view(name, meta, stale))  # type: ignore[no-any-return]
+        return self._get_cached(("merge", meta["hash"], stale), lambda: merge_view(name, meta, stale))  # type: ignore[no-any-return]
 
     def _read_measurements(self, inputs: _Inputs) -> tuple[Measurement, ...]:
-        """All measurements, in the order in which they were made, stale as ``pipeline.measurements`` defines it."""
+        """Read all measurements, in the order they were made; stale as ``pipeline.measurements`` defines it."""
         known, read, names = dict(inputs.hashes), [], self.session.decision(NAMES) or {}
         results = self.session.result_names()
         for kind in ("scale/", "merge/", f"{MEASUREMENTS}/"):  # each is made from captures and from those before it
             for result in (name for name in results if name.startswith(kind)):
-                meta = self._meta(result)
+                meta = self._load_meta(result)
                 scales = meta.get("scales", {})
                 if kind == f"{MEASUREMENTS}/":
                     scales = {meta["model"]: used} if (used := meta["data"].get("scale")) is not None else {}
-                stale = _differs(meta.get("inputs", {}), known) or _differs(scales, inputs.factors)
+                stale = _has_changed(meta.get("inputs", {}), known) or _has_changed(scales, inputs.factors)
                 if kind == f"{MEASUREMENTS}/":
                     read.append(measurement_from_meta(result.removeprefix(kind), meta, names, stale))
                 if not stale:
@@ -371,13 +387,16 @@ class SessionReader:
 
     # files
 
-    def _results(self, prefix: str) -> list[str]:
+    def _list_results(self, prefix: str) -> list[str]:
+        """List the names of the results with a prefix, in natural order."""
         return sorted((n for n in self.session.result_names() if n.startswith(prefix)), key=natural_key)
 
-    def _meta(self, result: str) -> dict[str, Any]:
+    def _load_meta(self, result: str) -> dict[str, Any]:
+        """Load the `meta` of a result, without its arrays."""
         return self.session.load_result(result, only=())[0]
 
-    def _cached(self, key: Any, make: Callable[[], Any]) -> Any:
+    def _get_cached(self, key: Any, make: Callable[[], Any]) -> Any:
+        """Return the cached value of a key, computed by `make()` where missing; a full cache is cleared."""
         if key not in self._cache:
             if len(self._cache) > MOST_CACHED:
                 self._cache.clear()
@@ -385,17 +404,19 @@ class SessionReader:
         return self._cache[key]
 
 
-def _differs(used: Mapping[str, object], now: Mapping[str, object]) -> bool:
+def _has_changed(used: Mapping[str, object], now: Mapping[str, object]) -> bool:
+    """Whether any name of `used` is missing from `now` or has another value there."""
     return any(now.get(name) != value for name, value in used.items())
 
 
 def _is_verdict_of(verdict: Verdict | None, meta: Mapping[str, Any]) -> bool:
+    """Whether the verdict is the one saved with a calibration's `meta`."""
     saved = meta.get("verdict")
     return verdict is not None and saved is not None and from_plain(saved, Verdict) == verdict
 
 
 def _load_fit_rms(session: Session) -> dict[str, Mapping[str, float]] | None:
-    """{axis: {coefficient: median mm}}; None where another version has saved the model."""
+    """Load {axis: {coefficient: median mm}} of the pixel-wise model; None where another version saved it."""
     try:
         model = load_model(session, "pixelwise")
     except SessionError:
@@ -405,7 +426,7 @@ def _load_fit_rms(session: Session) -> dict[str, Mapping[str, float]] | None:
 
 
 def _load_splined(session: Session) -> SplinedView | None:
-    """None where another version has saved the model."""
+    """Load the summary of the splined model; None where another version saved it."""
     try:
         model = load_model(session, "splined")
     except SessionError:

@@ -135,7 +135,7 @@ class CalibrationView:
 
     @property
     def refused(self) -> str:
-        """Why later steps do not use it; empty where they do."""
+        """Why later steps do not use the calibration; empty where they do."""
         return "" if self.is_pinned else self.rejected
 
 
@@ -240,6 +240,7 @@ class Space:
 
     @property
     def enough(self) -> bool:
+        """Whether more than twice the space of the next capture is free; True where its need is unknown."""
         return self.capture_bytes is None or self.free_bytes > 2 * self.capture_bytes
 
 
@@ -292,10 +293,12 @@ class SessionView:
 
     @property
     def coverage(self) -> Coverage | None:
+        """What the poses cover; None before the devices' sizes are known."""
         return None if self.plan is None else self.plan.coverage
 
     @property
     def suggestion(self) -> Suggestion | None:
+        """The suggested next pose; None where there is no suggestion."""
         return None if self.plan is None else self.plan.suggestion
 
 
@@ -337,28 +340,30 @@ class Snapshot:
 
     @property
     def calibration(self) -> CalibrationView | None:
-        """The session's calibration, if there is one."""
+        """The session's calibration; None where there is none."""
         return self.session.calibration if self.session else None
 
     def step(self, key: str) -> StepView:
-        """The step called `key`."""
+        """Return the step called `key`."""
         return next(step for step in self.steps if step.key == key)
 
     def pose(self, name: str) -> PoseView | None:
-        """The pose called `name`, if there is one."""
+        """Return the pose called `name`; None where there is none."""
         poses = self.session.poses if self.session else ()
         return next((pose for pose in poses if pose.name == name), None)
 
     def scan(self, name: str) -> ScanView | None:
-        """The scan called `name`, if there is one."""
+        """Return the scan called `name`; None where there is none."""
         scans = self.session.scans if self.session else ()
         return next((scan for scan in scans if scan.name == name), None)
 
 
 @dataclass(frozen=True, eq=False)
 class BoardSeen:
-    """The board in the preview: features (n, 2) and outline (4, 2), camera px; `still_s` since it last moved; `time_s`:
-    when the image was taken, by the monotonic clock."""
+    """The board in the preview: features (n, 2) and outline (4, 2), camera px, and its approximate pose (4, 4) mm.
+
+    `still_s`: seconds since it last moved; `time_s`: when the image was captured, by the monotonic clock.
+    """
 
     pixels: np.ndarray
     outline: np.ndarray

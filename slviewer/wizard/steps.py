@@ -21,7 +21,7 @@ Brightness = Literal["", "saturated", "dim"]
 
 @dataclass(frozen=True)
 class Facts:
-    """What the steps depend on; `session` is None until one is open."""
+    """State that the steps depend on; `session` is None until one is open."""
 
     session: SessionView | None
     rig: RigView
@@ -30,24 +30,27 @@ class Facts:
 
     @property
     def good_poses(self) -> int:
-        """Poses that a calibration can use."""
+        """Number of poses that a calibration can use."""
         poses = self.session.poses if self.session else ()
         return sum(pose.state in ("good", "used", "unused") for pose in poses)
 
     @property
     def scans(self) -> int:
-        """Scans with an up-to-date cloud."""
+        """Number of scans with an up-to-date cloud."""
         scans = self.session.scans if self.session else ()
         return sum(scan.purpose == "scan" and scan.cloud == "fresh" for scan in scans)
 
     @property
     def calibration(self) -> CalibrationView | None:
+        """The session's calibration; None where there is none."""
         return self.session.calibration if self.session else None
 
 
 @dataclass(frozen=True)
 class Step:
-    """`blocked(facts)`: why it cannot be done yet, or empty; `done(facts)`; `instruction(facts)`: what to do, in one
+    """Definition of one step: functions of the facts that give its state and texts.
+
+    `blocked(facts)`: why it cannot be done yet, or empty; `done(facts)`; `instruction(facts)`: what to do, in one
     sentence; `problems(facts)`: what is wrong, and how to correct it.
     """
 
@@ -60,7 +63,7 @@ class Step:
 
 
 def views(facts: Facts) -> tuple[StepView, ...]:
-    """Every step as the panels show it."""
+    """Evaluate every step for the panels: its state, instruction and problems."""
     made = []
     for step in STEPS:
         blocked = step.blocked(facts)
@@ -70,20 +73,23 @@ def views(facts: Facts) -> tuple[StepView, ...]:
     return tuple(made)
 
 
-def _plural(n: int, noun: str) -> str:
+def _format_count(n: int, noun: str) -> str:
+    """Return a count and its noun, in the plural unless `n` is 1."""
     return f"{n} {noun}{'s' * (n != 1)}"
 
 
 def _no_session(facts: Facts) -> str:
+    """Return the instruction to open a session where none is open; else empty."""
     return "" if facts.session else "Open or create a session first."
 
 
 def _no_problems(facts: Facts) -> Iterator[str]:
+    """Return no problems."""
     return iter(())
 
 
 def _device_problems(facts: Facts) -> Iterator[str]:
-    """What prevents or spoils a capture."""
+    """Yield problems of rig, disk space and image brightness that prevent or degrade a capture."""
     if facts.rig.state == "lost" and facts.rig.camera is None:
         yield f"The rig cannot be used: {facts.rig.fault}. Try again in the step Rig, or choose another."
     elif facts.rig.state == "lost":
@@ -98,6 +104,7 @@ def _device_problems(facts: Facts) -> Iterator[str]:
 
 
 def _rig_instruction(facts: Facts) -> str:
+    """Return the instruction of the step Rig."""
     if facts.rig.state == "none":
         return "Choose your camera and projector, or the simulated rig."
     if facts.rig.state == "opening":
@@ -106,12 +113,14 @@ def _rig_instruction(facts: Facts) -> str:
 
 
 def _target_instruction(facts: Facts) -> str:
+    """Return the instruction of the step Target."""
     if facts.session is None or not facts.session.target:
         return "Choose your board, or print one and measure its scale bar."
     return f"Hold the board {facts.session.target} in view until it is detected."
 
 
 def _poses_blocked(facts: Facts) -> str:
+    """Return why poses cannot be captured yet: no session, target or rig; else empty."""
     if facts.session is None:
         return _no_session(facts)
     if not facts.session.target:
@@ -122,6 +131,7 @@ def _poses_blocked(facts: Facts) -> str:
 
 
 def _poses_done(facts: Facts) -> bool:
+    """Whether the poses suffice, by number and by predicted sigma or coverage."""
     session = facts.session
     # cells that the projector never reaches cannot be covered: many poses are enough too
     enough = facts.good_poses >= MANY_POSES or facts.rig.state == "none"
@@ -131,6 +141,7 @@ def _poses_done(facts: Facts) -> bool:
 
 
 def _poses_instruction(facts: Facts) -> str:
+    """Return the instruction of the step Poses: the suggested next pose, or that there are enough."""
     session, n = facts.session, facts.good_poses
     if session is None:
         return "Hold the board in view of camera and projector."
@@ -152,6 +163,7 @@ def _poses_instruction(facts: Facts) -> str:
 
 
 def _poses_problems(facts: Facts) -> Iterator[str]:
+    """Yield device problems, and which of the last three poses were refused and why."""
     yield from _device_problems(facts)
     for pose in facts.session.poses[-3:] if facts.session else ():
         if pose.state == "refused":
@@ -159,6 +171,7 @@ def _poses_problems(facts: Facts) -> Iterator[str]:
 
 
 def _calibrate_blocked(facts: Facts) -> str:
+    """Return why calibrating is not possible yet: no session, target or too few poses; else empty."""
     if facts.session is None:
         return _no_session(facts)
     if facts.calibration is not None:
@@ -171,11 +184,13 @@ def _calibrate_blocked(facts: Facts) -> str:
 
 
 def _calibrate_done(facts: Facts) -> bool:
+    """Whether there is a calibration that is up to date and not refused."""
     calibration = facts.calibration
     return calibration is not None and not calibration.stale and not calibration.refused
 
 
 def _calibrate_instruction(facts: Facts) -> str:
+    """Return the instruction of the step Calibrate, with the number of poses and the reprojection RMS."""
     calibration, n = facts.calibration, facts.good_poses
     if calibration is None:
         return f"Calibrate from {n} poses."
@@ -191,22 +206,25 @@ def _calibrate_instruction(facts: Facts) -> str:
 
 
 def _calibrate_problems(facts: Facts) -> Iterator[str]:
+    """Yield why to calibrate again, and a warning where there are poses for the stereo model only."""
     if facts.session is None:
         return
     if facts.calibration is not None:
         if facts.calibration.stale:
             yield f"The calibration is out of date: {facts.calibration.stale}."
         elif added := sum(pose.state == "good" for pose in facts.session.poses):
-            yield f"{_plural(added, 'good pose')} captured after the calibration: calibrate again to use them."
+            yield f"{_format_count(added, 'good pose')} captured after the calibration: calibrate again to use them."
     if MIN_POSES <= facts.good_poses < POSES_FOR_PIXELWISE:
         yield f"With fewer than {POSES_FOR_PIXELWISE} poses only the stereo model is reliable: capture more."
 
 
 def _not_calibrated(facts: Facts) -> str:
+    """Return what is missing, a session or a calibration; else empty."""
     return _no_session(facts) or ("" if facts.calibration else "Calibrate first.")
 
 
 def _no_usable_calibration(facts: Facts) -> str:
+    """Return why there is no calibration to measure with, none or a rejected one; else empty."""
     if facts.calibration is None:
         return _not_calibrated(facts)
     if reason := facts.calibration.refused:
@@ -215,34 +233,40 @@ def _no_usable_calibration(facts: Facts) -> str:
 
 
 def _capture_problems(facts: Facts) -> Iterator[str]:
+    """Yield device problems, and whether the calibration is out of date."""
     yield from _device_problems(facts)
     if facts.calibration is not None and facts.calibration.stale:
         yield f"The calibration is out of date: {facts.calibration.stale}."
 
 
 def _verify_done(facts: Facts) -> bool:
+    """Whether there is an up-to-date verification."""
     return facts.session is not None and any(not row.stale for row in facts.session.verifications)
 
 
 def _verify_instruction(facts: Facts) -> str:
+    """Return the instruction of the step Verify."""
     if _verify_done(facts):
         return "Compare RMS with the noise floor; capture planes and spheres at other depths."
     return "Put a flat plate or a sphere in view, and capture it."
 
 
 def _verify_problems(facts: Facts) -> Iterator[str]:
+    """Yield capture problems, and verifications of an older calibration."""
     yield from _capture_problems(facts)
     if stale := sorted({row.capture for row in facts.session.verifications if row.stale}) if facts.session else []:
-        yield f"{_list_names(stale)} measured with an older calibration: measure again."
+        yield f"{_join_names(stale)} measured with an older calibration: measure again."
 
 
 def _scan_instruction(facts: Facts) -> str:
+    """Return the instruction of the step Scan."""
     if facts.scans == 0:
         return "Put the object in view, and capture it."
-    return f"{_plural(facts.scans, 'scan')}: turn or move the object for another, or merge them next."
+    return f"{_format_count(facts.scans, 'scan')}: turn or move the object for another, or merge them next."
 
 
 def _scan_problems(facts: Facts) -> Iterator[str]:
+    """Yield capture problems, and scans whose cloud is of an older calibration."""
     yield from _capture_problems(facts)
     for scan in facts.session.scans if facts.session else ():
         if scan.cloud == "stale":
@@ -250,6 +274,7 @@ def _scan_problems(facts: Facts) -> Iterator[str]:
 
 
 def _merge_blocked(facts: Facts) -> str:
+    """Return why merging is not possible yet: no usable calibration, or fewer than two scans; else empty."""
     if why := _no_usable_calibration(facts):
         return why
     if facts.scans < 2 and not (facts.session and facts.session.merge):
@@ -258,16 +283,19 @@ def _merge_blocked(facts: Facts) -> str:
 
 
 def _merge_done(facts: Facts) -> bool:
+    """Whether there is an up-to-date merge."""
     return facts.session is not None and facts.session.merge is not None and not facts.session.merge.stale
 
 
 def _merge_instruction(facts: Facts) -> str:
+    """Return the instruction of the step Merge."""
     if _merge_done(facts):
         return "Check the alignment; undo the merge if it is wrong, or measure next."
     return "Choose the scans and the reference, and merge."
 
 
 def _merge_problems(facts: Facts) -> Iterator[str]:
+    """Yield whether the merge is stale, and scans whose overlap is too small."""
     merge = facts.session.merge if facts.session else None
     if merge is None:
         return
@@ -279,6 +307,7 @@ def _merge_problems(facts: Facts) -> Iterator[str]:
 
 
 def _measure_blocked(facts: Facts) -> str:
+    """Return why measuring is not possible yet: no usable calibration or no scan; else empty."""
     if why := _no_usable_calibration(facts):
         return why
     session = facts.session
@@ -288,28 +317,33 @@ def _measure_blocked(facts: Facts) -> str:
 
 
 def _measure_done(facts: Facts) -> bool:
+    """Whether there is an up-to-date measurement."""
     return facts.session is not None and any(not measured.stale for measured in facts.session.measurements)
 
 
 def _measure_instruction(facts: Facts) -> str:
+    """Return the instruction of the step Measure."""
     if facts.session is not None and _measure_done(facts):
         n = sum(not measured.stale for measured in facts.session.measurements)
-        return f"{_plural(n, 'measurement')}: add more, or export next."
+        return f"{_format_count(n, 'measurement')}: add more, or export next."
     return "Choose a surface and a tool, then click in the 3D view; or export next."
 
 
 def _measure_problems(facts: Facts) -> Iterator[str]:
+    """Yield the stale measurements, whose surface has changed."""
     if stale := [measured.name for measured in facts.session.measurements if measured.stale] if facts.session else []:
-        yield f"{_list_names(stale)}: the measured surface has changed; measure again."
+        yield f"{_join_names(stale)}: the measured surface has changed; measure again."
 
 
 def _export_instruction(facts: Facts) -> str:
+    """Return the instruction of the step Export."""
     if exports := facts.session.exports if facts.session else ():
-        return f"{_plural(len(exports), 'file')} to download."
+        return f"{_format_count(len(exports), 'file')} to download."
     return "Choose what to write: a cloud, a mesh, the calibration, the report."
 
 
-def _list_names(names: list[str]) -> str:
+def _join_names(names: list[str]) -> str:
+    """Join the first three names with commas; further ones are counted."""
     return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
 
 

@@ -18,7 +18,7 @@ NOMINALS = "nominal"
 
 
 class Surfaces:
-    """Loads surfaces, and caches the last one: each click needs the same. For any thread."""
+    """Loads surfaces to measure on, and caches the last one. Every method may be called from any thread."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -26,7 +26,7 @@ class Surfaces:
         self._cached: MeasuredSurface | None = None
 
     def load(self, store: Session, name: str) -> MeasuredSurface:
-        """A capture's cloud as it was reconstructed, or a merge (``merge/<number>``).
+        """Load a capture's reconstructed cloud, or a merge (``merge/<number>``), as a surface.
 
         Raises InputError where there is none, or where what it was made from has changed since.
         """
@@ -47,6 +47,7 @@ class Surfaces:
 
 
 def _load_scan(store: Session, name: str) -> MeasuredSurface:
+    """Load the cloud of a scan as a surface, with its uncertainties and the model that it was made by."""
     meta, arrays = store.load_result(f"clouds/{name}")
     systematic = arrays.get("sigma_calibration")
     points, sigma, texture = (arrays[each] for each in ("points", "sigma_z", "texture"))
@@ -55,8 +56,10 @@ def _load_scan(store: Session, name: str) -> MeasuredSurface:
 
 
 def place_at(on: MeasuredSurface, origin: np.ndarray, direction: np.ndarray) -> Place | None:
-    """The measured point closest to a ray from origin (3,) mm along direction (3,), in the surface's frame; None where
-    the ray passes it by."""
+    """Return the measured point closest to a ray from origin (3,) mm along direction (3,), in the surface's frame.
+
+    None where the ray passes the surface.
+    """
     index = nearest(on.points, origin, direction)
     if index is None:
         return None
@@ -64,12 +67,12 @@ def place_at(on: MeasuredSurface, origin: np.ndarray, direction: np.ndarray) -> 
 
 
 def point_at(on: MeasuredSurface, place: Place) -> np.ndarray:
-    """(3,) mm: the point of a place."""
+    """Return the point (3,) mm of a place on the surface."""
     index = (place[1], place[0]) if isinstance(place, tuple) else (place,)
     return np.asarray(on.points[index], np.float64)
 
 
 def list_nominals(folder: Path) -> tuple[str, ...]:
-    """Names of the nominal models in a session's folder."""
+    """List the names of the nominal models in a session's folder."""
     entries = (folder / NOMINALS).glob("[!.]*")
     return tuple(sorted(entry.name for entry in entries))

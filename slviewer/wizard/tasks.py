@@ -46,14 +46,14 @@ def calibrate_session(session: Session, target: str, report: Reporter, warn: War
 
 
 def describe_calibration(made: CalibrationResult) -> tuple[Level, str]:
-    """The result in one sentence, and its level."""
+    """Describe a calibration result in one sentence: (level, text)."""
     rms = made.stereo.reprojection_rms_px["stereo"]
     text = f"calibrated from {len(made.stereo.poses)} poses: reprojection RMS {rms:.3f} px"
     return ("good", text) if made.verdict.level == "good" else ("warning", f"{text}; doubtful: {made.verdict.reason}")
 
 
 def missing_for_splined(session: Session) -> str:
-    """What the poses lack for the splined model; empty where they allow it."""
+    """Describe what the poses lack for the splined model; empty where they allow it."""
     excluded = session.excluded()
     poses = [capture for capture in session.captures("calibration") if capture.name not in excluded]
     both = sum(len(capture.sequence.axes) == 2 for capture in poses)
@@ -66,12 +66,12 @@ def missing_for_splined(session: Session) -> str:
 
 
 def compare_models(session: Session, report: Reporter, warn: Warn) -> CrossValidation:
-    """Measure each pose by calibrations made without it, and save how the models compare."""
+    """Cross-validate the models on poses they were not calibrated from, and save the comparison."""
     return validate(session.guarded(report.saving), progress=report, warn=warn)
 
 
 def describe_comparison(compared: CrossValidation) -> str:
-    """The result in one sentence."""
+    """Describe the comparison of the models in one sentence: held-out errors, and the recommended model."""
     figures = ", ".join(f"{model} {compared.rms(model, 'board_mm'):.3f} mm" for model in compared.models)
     return f"held-out error of the models: {figures}; {compared.recommended} is recommended"
 
@@ -120,8 +120,10 @@ def reconstruct_capture(session: Session, name: str, model: str | None, report: 
 def verify_captures(
     session: Session, names: list[str], shape: Shape, radius: float | None, report: Reporter, warn: Warn
 ) -> dict[str, dict[str, float]]:
-    """Compare the models on captures of a plane or a sphere, save error maps and clouds; returns {capture: {model: RMS
-    mm}}."""
+    """Compare the models on captures of a plane or a sphere, and save error maps and clouds.
+
+    Returns {capture: {model: RMS mm}}.
+    """
     rms = {}
     for i, name in enumerate(names):
         span = report.within(i / len(names), (i + 1) / len(names))
@@ -154,7 +156,7 @@ def verify_captures(
 
 
 def describe_verifications(rms: dict[str, dict[str, float]]) -> str:
-    """The result in one sentence."""
+    """Describe verifications in one sentence: the RMS mm of each model on each capture."""
     figures = {name: ", ".join(f"{m} {mm:.3f} mm" for m, mm in models.items()) for name, models in rms.items()}
     return "; ".join(f"{name}: RMS {text}" for name, text in figures.items())
 
@@ -185,6 +187,6 @@ def merge_scans(
 
 
 def describe_merge(reference: str, result: Merge) -> str:
-    """The result in one sentence."""
+    """Describe a merge in one sentence: the RMS mm and overlap of each scan."""
     pairs = (f"{n} RMS {p.rms_mm:.3f} mm, overlap {100 * p.overlap:.0f} %" for n, p in result.pairs.items())
     return f"merged on {reference}: {'; '.join(pairs)}"
