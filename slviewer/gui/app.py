@@ -72,6 +72,7 @@ class App:
         self.server.stop()
 
     def _start(self) -> None:
+        """Build the page and its shell, subscribe to snapshots and previews, and start the drawing thread."""
         page, operator = self.server.viser, self.operator
         page.gui.configure_theme(brand_color=_BRAND, control_width="large", dark_mode=False)
         page.initial_camera.position, page.initial_camera.look_at = OVERVIEW
@@ -88,18 +89,18 @@ class App:
             ViewerScene(page.scene),
             Viewpoints(lambda: page.get_clients().values()),
             operator,
-            self._offer,
+            self._offer_download,
             self._notify,
-            self._go,
+            self._show_step,
             self._report_failure,
             self._executor,
             partial(Viewers, page),
-            self._projector_page,
+            self._get_page_state,
         )
         snapshot = operator.snapshot()
         self._notified = snapshot.notices[-1].number if snapshot.notices else 0
         self.shell = Shell(context, snapshot.steps)
-        page.on_client_connect(self._greet)
+        page.on_client_connect(self._greet_client)
         self._unsubscribe = operator.subscribe(lambda _: self._changed.set(), lambda _: self._changed.set())
         self._thread = threading.Thread(target=self._draw_forever, name="slviewer drawing", daemon=True)
         self._thread.start()
@@ -107,6 +108,7 @@ class App:
     # drawing
 
     def _draw_forever(self) -> None:
+        """Draw new snapshots and previews until closing; a failure is reported once and retried every second."""
         version, number, page = -1, -1, None
         while not self._closing:
             begun = time.monotonic()
@@ -114,7 +116,7 @@ class App:
             self._changed.clear()
             if self._closing:
                 return
-            if page != (page := self._projector_page()):
+            if page != (page := self._get_page_state()):
                 version = -1
             try:
                 version, number = self._draw(version, number)
@@ -127,7 +129,7 @@ class App:
             time.sleep(max(0.0, 1 / DRAWN_PER_S - (time.monotonic() - begun)))
 
     def _draw(self, version: int, number: int) -> tuple[int, int]:
-        """Draw what is newer than this version of the snapshot and number of the preview; returns those drawn."""
+        """Draw the snapshot and the preview if they are newer than these; returns the version and number drawn."""
         snapshot, preview = self.operator.snapshot(), self.operator.preview()
         folder = snapshot.session.folder if snapshot.session else None
         if folder != self._folder:
@@ -149,27 +151,33 @@ class App:
     # what panels use
 
     def _notify(self, level: Level, text: str) -> None:
+        """Show a notification in every browser."""
         for client in self.server.viser.get_clients().values():
             notify(client, level, text)
 
     def _report_failure(self, error: BaseException) -> None:
+        """Show an error as a notification in every browser."""
         self._notify("error", describe_error("This", error))
 
-    def _go(self, key: str) -> None:
+    def _show_step(self, key: str) -> None:
+        """Show another step, drawn at once."""
         self.shell.go(key)
         self._changed.set()
 
-    def _offer(self, path: Path) -> str:
+    def _offer_download(self, path: Path) -> str:
+        """Return the download address of a file of the session, cached by path."""
         if path not in self._offers:
             session = self.operator.snapshot().session
             folder = session.folder if session is not None else path.parent
             self._offers[path] = self.server.downloads.offer(path, within=folder)
         return self._offers[path]
 
-    def _projector_page(self) -> PageState | None:
+    def _get_page_state(self) -> PageState | None:
+        """Return the state of the projector page; None where none is served."""
         return None if self.channel is None else self.channel.page_state()
 
-    def _greet(self, client: viser.ClientHandle) -> None:
+    def _greet_client(self, client: viser.ClientHandle) -> None:
+        """Show a browser that connected by the view-only link that it may only watch."""
         if self.server.role(client.client_id) == "viewer":
             greet_viewer(client)
 
@@ -208,7 +216,10 @@ def run(
 
 
 def rig_choice(text: str, session: Session | None = None) -> dict[str, Any]:
-    """What `Operator.choose_rig` takes: "simulated" (half resolution), "simulated:0.25", a preset's name or a file."""
+    """Parse a rig from text: "simulated" (half resolution), "simulated:0.25", a preset's name or a file.
+
+    Returns the choice that `Operator.choose_rig` takes. Raises UsageError for an invalid scale.
+    """
     name, _, scale = text.partition(":")
     if name != "simulated":
         return load_rig(text, session)
@@ -227,13 +238,14 @@ def _wait_for_stop() -> None:
 
 
 def _check_granted(operator: Operator, granted: bool) -> None:
-    """Raise SlviewerError with the notice of a request that was refused."""
+    """Raise SlviewerError with the notice of the error unless a request was granted."""
     if not granted:
         failed = operator.wait_for(lambda s: any(n.level == "error" for n in s.notices), 2.0)
         raise SlviewerError(failed.notices[-1].text if failed else "the wizard could not start: see its log")
 
 
 def _open_browser(url: str) -> None:
+    """Open an address in the default browser without waiting; nothing happens where there is none."""
     try:
         webbrowser.get()
     except webbrowser.Error:

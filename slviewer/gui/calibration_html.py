@@ -22,14 +22,16 @@ MIN_WEIGHT = 0.7
 
 
 def verdict_html(verdict: Verdict, of_calibration: bool, calibration: CalibrationView | None) -> Html:
-    """The level as text, colour and icon, then every finding with its remedy. `of_calibration`: whether the judged
-    attempt made the current calibration."""
+    """Return the verdict as text, colour and icon, then every finding with its remedy.
+
+    `of_calibration`: whether the judged attempt made the current calibration.
+    """
     tone, level, meaning = _LEVELS[verdict.level]
     lines = [
-        f'<div style="display:flex;gap:0.5em;align-items:flex-start">{_icon(tone)}'
+        f'<div style="display:flex;gap:0.5em;align-items:flex-start">{_draw_icon(tone)}'
         f"<div>{coloured(level, tone, bold=True)}: {to_html(meaning)}</div></div>"
     ]
-    lines += [_finding(finding) for finding in verdict.findings]
+    lines += [_format_finding(finding) for finding in verdict.findings]
     if not of_calibration:
         consequence = (
             "This attempt gave no calibration."
@@ -41,7 +43,7 @@ def verdict_html(verdict: Verdict, of_calibration: bool, calibration: Calibratio
 
 
 def named_poses(verdict: Verdict | None, calibration: CalibrationView | None) -> tuple[str, ...]:
-    """Poses that the verdict or the joint adjustment names, each once."""
+    """List the poses that the verdict or the joint adjustment names, each once."""
     names = [name for finding in verdict.findings for name in finding.poses] if verdict else []
     if calibration is not None and calibration.splined is not None:
         names += calibration.splined.summary["left_out"]
@@ -49,7 +51,7 @@ def named_poses(verdict: Verdict | None, calibration: CalibrationView | None) ->
 
 
 def exclusions_html(calibration: CalibrationView) -> Html:
-    """Excluded poses and features, each with its reason; empty where there are none."""
+    """List excluded poses and features, each with its reason; empty where there are none."""
     n = calibration.stereo.features_excluded
     features = (
         f"{n} outlying feature{'s' * (n != 1)} excluded (beyond 6 robust sigma): shadow or occlusion." if n else ""
@@ -69,7 +71,7 @@ def exclusions_html(calibration: CalibrationView) -> Html:
 
 
 def model_choice_html(calibration: CalibrationView) -> Html:
-    """Which model is used, and why."""
+    """Describe which model is used, and why; empty where there is only one."""
     if calibration.chosen and calibration.chosen != calibration.recommended:
         return alert(
             f"{calibration.chosen} is used (your choice); {calibration.recommended} is recommended.", "warning"
@@ -86,7 +88,7 @@ def model_choice_html(calibration: CalibrationView) -> Html:
 
 
 def splined_html(splined: SplinedView) -> Html:
-    """The results of the joint adjustment, and poses with a low weight or turned by 180 degrees."""
+    """Return a table of the joint adjustment, and poses with a low weight or turned by 180 degrees."""
     named = {
         f"Weights below {MIN_WEIGHT:g}": [
             f"{name} {min(pair):.2f}" for name, pair in splined.weights.items() if min(pair) < MIN_WEIGHT
@@ -97,7 +99,8 @@ def splined_html(splined: SplinedView) -> Html:
     return report_table(splined_table(splined.summary)) + "".join(paragraph(note) for note in notes)
 
 
-def _finding(finding: Finding) -> str:
+def _format_finding(finding: Finding) -> str:
+    """Return the HTML of a finding and its remedy."""
     text = to_html(_capitalise(finding.sentence, finding.poses))
     if finding.severity == "note":
         return f'<div style="margin-top:0.5em">{coloured("Corrected:", "dim")} {text}.</div>'
@@ -106,12 +109,13 @@ def _finding(finding: Finding) -> str:
 
 
 def _capitalise(text: str, names: Sequence[str] = ()) -> str:
-    """The text with a capital first letter, unless it begins with a name."""
+    """Return the text with a capital first letter, unless it begins with a name."""
     named = any(text.startswith(name) for name in names) or text.split(":")[0].count("_")
     return text if named else text[:1].upper() + text[1:]
 
 
-def _icon(tone: Tone) -> str:
+def _draw_icon(tone: Tone) -> str:
+    """Return the SVG icon of a tone: a disc with a check mark, an exclamation mark or a cross."""
     colour = {"good": "green-7", "warning": "orange-7", "error": "red-7"}[tone]
     return (
         '<svg viewBox="0 0 20 20" width="22" height="22" style="flex:none" fill="none" stroke="#fff" '

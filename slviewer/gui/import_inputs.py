@@ -19,7 +19,7 @@ _RESULTS: dict[Role, str] = {"calibration": "target poses", "scan": "scans"}
 
 
 class ImportInputs:
-    """A folder of a panel with the location, layout and role of the captures."""
+    """Inputs of a panel to import captures: location, layout and role."""
 
     def __init__(self, context: PanelContext, role: Role) -> None:
         gui, callback = context.gui, context.callback
@@ -64,7 +64,8 @@ class ImportInputs:
             empty = "of the layout or the session" if layout is None else "of the session"
         self._size_hint.write(f"Default size: {empty}.", "dim")
 
-    def _options(self) -> dict[str, Any]:
+    def _collect_options(self) -> dict[str, Any]:
+        """Return the import options that were entered: layout, role, projector, prefix, channel and codec."""
         chosen: dict[str, Any] = {"layout": self._layout.value or _DETECT, "role": self._role}
         for name, handle in (("projector", self._projector), ("prefix", self._prefix)):
             if handle.value.strip():
@@ -76,8 +77,10 @@ class ImportInputs:
         return chosen
 
     def _import_folder(self) -> None:
-        self._context.operator.import_folder(self._folder.value, **self._options())
+        """Request the import of the entered folder."""
+        self._context.operator.import_folder(self._folder.value, **self._collect_options())
 
     def _import_zip(self) -> None:
+        """Request the import of the uploaded zip."""
         file = self._upload.value
-        self._context.operator.import_zip(file.name, file.content, **self._options())
+        self._context.operator.import_zip(file.name, file.content, **self._collect_options())

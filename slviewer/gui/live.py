@@ -36,7 +36,7 @@ class LiveScreen:
         """Number of points drawn of the last cloud."""
 
     def offer(self, cloud: LiveCloud) -> None:
-        """Draw this one next, instead of any that is still waiting."""
+        """Set the cloud to draw next, in place of one that is still waiting."""
         with self._condition:
             self._cloud = cloud
             if self._thread is None:
@@ -51,15 +51,17 @@ class LiveScreen:
             self._condition.notify_all()
 
     def _wake(self) -> None:
+        """Wake the drawing thread: a browser has drawn what it was sent."""
         with self._condition:
             self._condition.notify_all()
 
     def _serve(self) -> None:
+        """Draw the latest cloud, or remove it, whenever it has changed or a browser is ready."""
         while True:
             with self._condition:
                 cloud = self._cloud
             try:
-                drawn = self._draw(cloud) if cloud is not None else self._remove()
+                drawn = self._draw_cloud(cloud) if cloud is not None else self._remove_cloud()
             except Exception as error:
                 self._context.failed(error)
                 drawn = False
@@ -68,20 +70,20 @@ class LiveScreen:
                     # a browser that connects does not notify this thread
                     self._condition.wait(None if cloud is None else 0.5)
 
-    def _draw(self, cloud: LiveCloud) -> bool:
-        """Send it to the browsers that are ready for it; returns whether there was any."""
+    def _draw_cloud(self, cloud: LiveCloud) -> bool:
+        """Send a cloud to the browsers that are ready for it; returns whether there was any."""
         clients = [c for c in self._viewers.ready() if self._drawn.get(c.client_id) != cloud.number]
         if not clients:
             return False
-        self._adapt()
+        self._adapt_limit()
         grey = to_eight_bits(cloud.texture)
         points, colours = thin(cloud.points, grey, self._limit)
         self.points = len(points)
         if not len(points):
-            return self._remove()
+            return self._remove_cloud()
         size = spacing(points)
         for client in clients:
-            self._send(client, points, colours, size)
+            self._send_cloud(client, points, colours, size)
             self._drawn[client.client_id] = cloud.number
         if not self._is_in_view:
             self._is_in_view = True
@@ -91,7 +93,8 @@ class LiveScreen:
             self._context.operator.count_live_shown(cloud)
         return True
 
-    def _send(self, client: viser.ClientHandle, points: np.ndarray, colours: np.ndarray, size: float) -> None:
+    def _send_cloud(self, client: viser.ClientHandle, points: np.ndarray, colours: np.ndarray, size: float) -> None:
+        """Send points (n, 3) mm with colours to one browser, as a new or an updated node."""
         number = client.client_id
         with client.atomic():
             if number not in self._nodes:
@@ -109,13 +112,15 @@ class LiveScreen:
                 node.points, node.colors, node.point_size = points, colours, size
             self._viewers.sent(client)
 
-    def _remove(self) -> bool:
+    def _remove_cloud(self) -> bool:
+        """Remove the cloud from all browsers; returns False, as nothing was drawn."""
         nodes, self._nodes, self._drawn = self._nodes, {}, {}
         for node in nodes.values():
             node.remove()
         return False
 
-    def _adapt(self) -> None:
+    def _adapt_limit(self) -> None:
+        """Adapt the number of points to the slowest browser, and forget browsers that have disconnected."""
         slowest = self._viewers.slowest_s()
         if slowest > _SLOW_S:
             self._limit = max(int(0.8 * self._limit), FEWEST_POINTS)

@@ -22,7 +22,7 @@ _EXTENT_MM = 15.0
 
 
 def format_quantity(quantity: Quantity) -> str:
-    """Value ± U (k = 2) with the unit; a star where the calibration's part of U is unknown."""
+    """Format value ± U (k = 2) with the unit; a star where the calibration's part of U is unknown."""
     digits = 1 if quantity.unit == "%" else 3
     unit = _UNITS.get(quantity.unit, f" {quantity.unit}")
     value = f"{round(quantity.value, digits) + 0.0:.{digits}f}".replace("-", "−")  # no minus before nothing
@@ -32,7 +32,7 @@ def format_quantity(quantity: Quantity) -> str:
 
 
 def label(measured: Measurement) -> str:
-    """Its label in 3D: the name, and the first quantity."""
+    """Return a measurement's label in 3D: the name, and the first quantity."""
     if measured.kind in ("point", "section", "deviation"):
         return measured.name
     first = quantities_of(measured)[0]
@@ -43,19 +43,19 @@ def label(measured: Measurement) -> str:
 def drawn(
     measured: Measurement, others: Mapping[str, Measurement], lines: Sequence[np.ndarray] = ()
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """((n, 2, 3) segments, (3,) position of its label) mm; None where nothing can be drawn.
+    """Draw a measurement: ((n, 2, 3) segments, (3,) position of its label) mm; None where nothing can be drawn.
 
     ``others``: all measurements by id; ``lines`` (k, 2) mm: of a section.
     """
     if measured.kind == "distance":
         a, b = (np.array(end) for end in measured.data["ends"])
-        return _dimension(a, b)
+        return _draw_dimension(a, b)
     if measured.kind == "section":
         plane = from_plain(measured.data["plane"], CutPlane)
         off = _OFF * float(np.ptp(np.concatenate(lines)[:, 0])) if lines else 0.0
         cut = [lifted(plane, line + np.array([0.0, off])) for line in lines]
         place = cut[0][np.argmax(cut[0] @ plane.up)] if cut else plane.origin
-        return np.concatenate([_chain(each) for each in cut]) if cut else np.empty((0, 2, 3)), place
+        return np.concatenate([_join_segments(each) for each in cut]) if cut else np.empty((0, 2, 3)), place
     if measured.kind == "relation":
         related = (feature_of(others[each]) for each in measured.of if each in others)
         ends = [feature for feature in related if feature is not None]
@@ -63,65 +63,72 @@ def drawn(
             return None
         # outside of both; a point is on the surface already
         clear = 0.0 if any(end.kind == "point" for end in ends) else 1.2 * max(end.radius or 0.0 for end in ends)
-        return _dimension(ends[0].place, ends[1].place, clear)
+        return _draw_dimension(ends[0].place, ends[1].place, clear)
     feature = feature_of(measured)
-    return None if feature is None else (_outline(feature, _extent(measured)), feature.place)
+    return None if feature is None else (_draw_outline(feature, _get_extent(measured)), feature.place)
 
 
 def feature_of(measured: Measurement) -> Feature | None:
-    """The point, plane, sphere or cylinder of a measurement; None of other kinds."""
+    """Return the point, plane, sphere or cylinder of a measurement; None for other kinds."""
     feature = measured.data.get("feature") or measured.data.get("fit", {}).get("feature")
     return None if feature is None else from_plain(feature, Feature)
 
 
 def lifted(plane: CutPlane, points: np.ndarray) -> np.ndarray:
-    """(n, 3) mm: points (n, 2) of a section's drawing, in space."""
+    """Convert points (n, 2) mm of a section's drawing to points (n, 3) in space."""
     return np.asarray(plane.origin + points[..., :1] * plane.along + points[..., 1:] * plane.up)
 
 
-def _outline(feature: Feature, extent: float) -> np.ndarray:
-    """(n, 2, 3) mm: a sphere's three great circles, a plane's disc with its normal, a cylinder's ends and axis."""
+def _draw_outline(feature: Feature, extent: float) -> np.ndarray:
+    """Draw a feature as segments (n, 2, 3) mm: great circles, a disc with its normal, a cylinder's rings and axis."""
     if feature.kind == "point":
-        return _cross(feature.place, 2.5)
+        return _draw_cross(feature.place, 2.5)
     if feature.kind == "sphere":
         assert feature.radius is not None
-        circles = [_circle(feature.place, axis, (1 + _OFF) * feature.radius) for axis in np.eye(3)]
-        return np.concatenate([*circles, _cross(feature.place, 0.1 * feature.radius)])
+        circles = [_draw_circle(feature.place, axis, (1 + _OFF) * feature.radius) for axis in np.eye(3)]
+        return np.concatenate([*circles, _draw_cross(feature.place, 0.1 * feature.radius)])
     assert feature.direction is not None
     along = extent * feature.direction
     if feature.kind == "plane":
         normal = np.array([[feature.place, feature.place + 0.4 * along]])
-        return np.concatenate([_circle(feature.place + _OFF * along, feature.direction, extent), normal])
+        return np.concatenate([_draw_circle(feature.place + _OFF * along, feature.direction, extent), normal])
     assert feature.radius is not None
     ends = [feature.place - along, feature.place + along]
-    rings = [_circle(end, feature.direction, (1 + _OFF) * feature.radius) for end in ends]
+    rings = [_draw_circle(end, feature.direction, (1 + _OFF) * feature.radius) for end in ends]
     return np.concatenate([*rings, np.array([ends])])
 
 
-def _dimension(a: np.ndarray, b: np.ndarray, clear_mm: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-    """A dimension line, offset towards the camera, with a leg to either end, as in a technical drawing."""
+def _draw_dimension(a: np.ndarray, b: np.ndarray, clear_mm: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """Draw a dimension line from `a` to `b`, offset towards the camera, with a leg to either end.
+
+    Returns ((3, 2, 3) segments, (3,) position of the label) mm; the legs are at least `clear_mm` long.
+    """
     middle = (a + b) / 2
     leg = max(_LEG * float(np.linalg.norm(b - a)), _SHORTEST_LEG_MM, clear_mm)
     up = -leg * middle / max(float(np.linalg.norm(middle)), 1e-9)
     return np.array([[a, a + up], [a + up, b + up], [b + up, b]]), middle + up
 
 
-def _circle(centre: np.ndarray, axis: np.ndarray, radius: float) -> np.ndarray:
+def _draw_circle(centre: np.ndarray, axis: np.ndarray, radius: float) -> np.ndarray:
+    """Draw a circle as segments (n, 2, 3) mm around a centre (3,), perpendicular to an axis (3,)."""
     first = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
     first /= np.linalg.norm(first)
     second = np.cross(axis, first)
     t = np.linspace(0, 2 * np.pi, _ROUND + 1)[:, None]
-    return _chain(centre + radius * (np.cos(t) * first + np.sin(t) * second))
+    return _join_segments(centre + radius * (np.cos(t) * first + np.sin(t) * second))
 
 
-def _cross(centre: np.ndarray, half: float) -> np.ndarray:
+def _draw_cross(centre: np.ndarray, half: float) -> np.ndarray:
+    """Draw a cross along the axes as segments (3, 2, 3) mm, `half` mm to either side of its centre."""
     return np.stack([centre - half * np.eye(3), centre + half * np.eye(3)], axis=1)
 
 
-def _chain(points: np.ndarray) -> np.ndarray:
+def _join_segments(points: np.ndarray) -> np.ndarray:
+    """Join consecutive points (n, 3) to segments (n - 1, 2, 3)."""
     return np.stack([points[:-1], points[1:]], axis=1)
 
 
-def _extent(measured: Measurement) -> float:
+def _get_extent(measured: Measurement) -> float:
+    """Return half the size, mm, at which to draw a fit: that of its region, or a default."""
     size = measured.data.get("region", {}).get("size")
     return float(np.max(size)) if size else _EXTENT_MM

@@ -25,7 +25,7 @@ _HIGH = 230
 
 
 def measurements_table(measured: Sequence[Measurement], chosen: str, labels: Mapping[str, str]) -> Html:
-    """Every measurement with its kind and surface; ``labels``: {scan: the operator's name}."""
+    """Return a table of all measurements with kind and surface; ``labels``: {scan: the operator's name}."""
     rows: list[tuple[object, object, object]] = []
     for each in reversed(measured):
         name = coloured(each.name, "warning" if each.stale else "plain", bold=each.id == chosen)
@@ -33,17 +33,17 @@ def measurements_table(measured: Sequence[Measurement], chosen: str, labels: Map
         about = coloured(f"{each.kind} on {on}" + (", stale" if each.stale else ""), "warning" if each.stale else "dim")
         for i, quantity in enumerate(quantities_of(each)[: _HEADLINES.get(each.kind, 2)]):
             rows.append((Html(f"{name}<br>{about}") if i == 0 else "", quantity.name, format_quantity(quantity)))
-    return Html(table(("Result", "", "Value"), rows) + _notes(measured))
+    return Html(table(("Result", "", "Value"), rows) + _format_notes(measured))
 
 
 def measurement_html(measured: Measurement, labels: Mapping[str, str]) -> Html:
-    """One measurement in full."""
+    """Return all quantities of one measurement, with its source and warnings."""
     on = labels.get(measured.source, measured.source)
     rows = [(quantity.name, format_quantity(quantity)) for quantity in quantities_of(measured)]
     about = f"{measured.kind} on {on}, by {measured.model}"
     if where := measured.data.get("where"):
         about += f"; {where}"
-    html = Html(table((measured.name, ""), rows) + paragraph(coloured(f"{about}.", "dim")) + _notes([measured]))
+    html = Html(table((measured.name, ""), rows) + paragraph(coloured(f"{about}.", "dim")) + _format_notes([measured]))
     for warning in measured.data.get("fit", {}).get("warnings", ()):
         html = Html(html + alert(f"{warning[:1].upper()}{warning[1:]}.", "warning"))
     if measured.stale:
@@ -52,7 +52,7 @@ def measurement_html(measured: Measurement, labels: Mapping[str, str]) -> Html:
 
 
 def verdict_html(data: Mapping[str, Any]) -> Html:
-    """A deviation's verdict, and the number of points evaluated."""
+    """Return a deviation's verdict, and the number of points evaluated."""
     verdict, numbers = data["verdict"], data["statistics_mm"]
     html = Html("")
     if verdict is not None:
@@ -78,13 +78,13 @@ def verdict_html(data: Mapping[str, Any]) -> Html:
 
 
 def deviation_bar(limit: float) -> Html:
-    """The legend of a surface that is coloured by its deviation."""
+    """Return the legend of a surface coloured by its deviation, ± `limit` mm."""
     title = "deviation; red: outside, blue: inside, grey: not measured"
     return colour_bar(f"−{limit:.3g} mm", f"+{limit:.3g} mm", deviation_colours(np.linspace(-1, 1, 13), 1.0), title)
 
 
 def deviation_figure(name: str, edges: np.ndarray, counts: np.ndarray, limit: float, tolerance: float | None) -> Figure:
-    """Histogram of the deviations: edges (n + 1,) mm and counts (n,)."""
+    """Plot the histogram of the deviations: edges (n + 1,) mm and counts (n,)."""
     drawing = new_figure(PLOT_PX, _HIGH)
     axes = drawing.subplots()
     style_axes(axes, "", "deviation, mm", "points, %")
@@ -95,7 +95,8 @@ def deviation_figure(name: str, edges: np.ndarray, counts: np.ndarray, limit: fl
     return finish_figure(drawing, "Histogram of the deviations.", name)
 
 
-def _notes(measured: Sequence[Measurement]) -> str:
+def _format_notes(measured: Sequence[Measurement]) -> str:
+    """Return a note on the uncertainties of the measurements; empty where none is known."""
     known = [quantity for each in measured for quantity in quantities_of(each) if quantity.U is not None]
     if not known:
         return ""

@@ -27,7 +27,7 @@ Lines = list[np.ndarray]
 
 
 class MeasurementList:
-    """The list and the chosen measurement; ``changed(measured)`` is called when another one is chosen."""
+    """List of measurements with a chosen one; ``changed(measured)`` is called when another one is chosen."""
 
     def __init__(
         self, context: PanelContext, painter: Painter, layer: str, changed: Callable[[Measurement | None], None]
@@ -42,7 +42,7 @@ class MeasurementList:
         self._lines: dict[str, tuple[CutPlane, Lines]] = {}
 
     def build(self) -> None:
-        """The inputs."""
+        """Create the inputs."""
         gui, context, operator = self._context.gui, self._context, self._context.operator
         with gui.add_folder("Result", visible=False) as self._chosen_folder:
             self._choice = Choice(gui, "Result")
@@ -52,7 +52,7 @@ class MeasurementList:
             self._section = SectionPlot(self._context, self.refresh)
             self._details = Text(gui)
             self._rename_to = gui.add_text("New name", "")
-            context.button("Rename", self._rename, viser.Icon.PENCIL)
+            context.button("Rename", self._request_rename, viser.Icon.PENCIL)
             delete = lambda: operator.delete_measurement(self._choice.value)  # noqa: E731
             context.button("Delete result", delete, viser.Icon.TRASH, "red", hint="Moves it to the session's trash")
         self._restore = context.button(
@@ -65,20 +65,21 @@ class MeasurementList:
 
     @property
     def chosen(self) -> Measurement | None:
-        """The chosen measurement."""
-        return next((each for each in self._measured if each.id == self._choice.value), None)
+        """The chosen measurement; None where there is none."""
+        return next((each for each in self._measurements if each.id == self._choice.value), None)
 
     def draw(self, session: SessionView | None, on: str) -> list[Measurement]:
         """Show the session's measurements, in 3D those on the surface ``on``; returns the new ones."""
         with self._lock:
-            return self._draw(session, on)
+            return self._draw_unlocked(session, on)
 
-    def _draw(self, session: SessionView | None, on: str) -> list[Measurement]:
+    def _draw_unlocked(self, session: SessionView | None, on: str) -> list[Measurement]:
+        """Update list, choice and buttons from the session, without locking; returns the new measurements."""
         if session is None or self._session is None or session.folder != self._session.folder:
             self._known = {each.id for each in session.measurements} if session else set()
-            self._clear()
+            self._clear_drawings()
         self._session, self._on = session, on
-        measured = self._measured
+        measured = self._measurements
         names = [each.name for each in measured]
         self._choice.offer(
             [
@@ -99,17 +100,18 @@ class MeasurementList:
         return new
 
     def change_surface(self, on: str) -> None:
-        """Another surface is shown: draw what was measured on it."""
+        """Draw the measurements of another surface."""
         self._on = on
         self.refresh()
 
     def refresh(self) -> None:
-        """Show the chosen measurement."""
+        """Update tables, plots and 3D drawings for the chosen measurement."""
         with self._lock:
-            self._refresh()
+            self._refresh_unlocked()
 
-    def _refresh(self) -> None:
-        chosen, measured = self.chosen, self._measured
+    def _refresh_unlocked(self) -> None:
+        """Update tables, plots and 3D drawings for the chosen measurement, without locking."""
+        chosen, measured = self.chosen, self._measurements
         if (chosen.id if chosen else "") != self._chosen_id:
             self._chosen_id = chosen.id if chosen else ""
             self._changed(chosen)
@@ -123,31 +125,35 @@ class MeasurementList:
     # inside
 
     @property
-    def _measured(self) -> tuple[Measurement, ...]:
+    def _measurements(self) -> tuple[Measurement, ...]:
+        """The session's measurements."""
         return self._session.measurements if self._session else ()
 
     @property
     def _labels(self) -> dict[str, str]:
+        """{name of a surface: its label}, for scans and the merge."""
         if self._session is None:
             return {}
         merge = self._session.merge
         merged = {} if merge is None else {f"merge/{merge.name}": f"merge of {len(merge.scans)} scans"}
         return {scan.name: scan.label for scan in self._session.scans} | merged
 
-    def _clear(self) -> None:
-        """Drop the drawings of another session, whose measurements have the same ids."""
+    def _clear_drawings(self) -> None:
+        """Remove all drawings, as the measurements of another session have the same ids."""
         for identity in self._drawn:
             self._context.scene.remove(self._layer, identity)
         self._drawn, self._lines, self._chosen_id = {}, {}, ""
         for place in ("drawings", "histogram", "section"):
             self._painter.cancel(place)
 
-    def _rename(self) -> None:
+    def _request_rename(self) -> None:
+        """Request the entered name for the chosen measurement."""
         if self._choice.value:
             self._context.operator.relabel_measurement(self._choice.value, self._rename_to.value)
             change(self._rename_to, value="")
 
     def _draw_deviation(self, measured: Measurement | None) -> None:
+        """Show the verdict and the histogram of a deviation; None: hide them."""
         if measured is None:
             self._painter.cancel("histogram")
             self._histogram.hide()
@@ -158,6 +164,7 @@ class MeasurementList:
         tolerance = None if verdict is None else float(verdict["tolerance_mm"])
 
         def make() -> Any:
+            """Plot the histogram of the deviation."""
             arrays = measurement_arrays(self._context.session, measured.id)
             limit = colour_limit(arrays["signed"], tolerance)
             return deviation_figure(measured.name, arrays["edges"], arrays["counts"], limit, tolerance)
@@ -165,7 +172,7 @@ class MeasurementList:
         self._painter.request("histogram", (measured.id, measured.name), make, self._histogram.set)
 
     def _draw_section(self, measured: Measurement | None) -> None:
-        """The plot with the cursors at their present positions, once the lines are read."""
+        """Show the plot of a section with its cursors, once its lines are read; None: hide it."""
         if measured is None or measured.id not in self._lines:
             self._painter.cancel("section")
             self._section.hide()
@@ -177,11 +184,13 @@ class MeasurementList:
         at, on, key = self._section.at, self._on, (measured.id, measured.name, self._section.at, self._on)
 
         def make() -> Any:
+            """Plot the section; returns (figure, cursors (3, 2) mm)."""
             cursors = cursor_points(lines, at)
             named = dict(zip(CURSORS, cursors, strict=True))
             return section_plot(measured.name, lines, named, width=PLOT_PX), cursors
 
         def show(made: Any) -> None:
+            """Show the plot, and mark the cursors in 3D if the section's surface is shown."""
             self._section.show(*made)
             for cursor, point in zip(CURSORS, lifted(plane, made[1]), strict=True):
                 if on == measured.source:
@@ -192,8 +201,8 @@ class MeasurementList:
         self._painter.request("section", key, make, show)
 
     def _request_drawings(self, chosen: Measurement | None) -> None:
-        """Draw all measurements on this surface in 3D; the lines of sections are read from the disk."""
-        measured = self._measured
+        """Request the 3D drawings of all measurements on this surface; the lines of sections are read from disk."""
+        measured = self._measurements
         others = {each.id: each for each in measured}
         shown = [
             each
@@ -204,10 +213,12 @@ class MeasurementList:
         looks = {each.id: (each.name, each.stale, each is chosen) for each in shown}
 
         def make() -> dict[str, tuple[CutPlane, Lines]]:
+            """Load the plane and the lines of each section that is not loaded yet."""
             store = self._context.session
             return {i: self._lines[i] if i in self._lines else section_lines(store, i) for i in cut}
 
         def show(lines: dict[str, tuple[CutPlane, Lines]]) -> None:
+            """Draw what has changed, and remove what is no longer there."""
             with self._lock:
                 loaded = lines.keys() - self._lines.keys()
                 self._lines = lines
@@ -219,11 +230,12 @@ class MeasurementList:
                         self._drawn[each.id] = looks[each.id]
                         self._draw_one(each, others, each is chosen)
                 if chosen is not None and chosen.id in loaded:
-                    self._refresh()
+                    self._refresh_unlocked()
 
         self._painter.request("drawings", (self._on, tuple(looks.items()), tuple(cut)), make, show)
 
     def _draw_one(self, measured: Measurement, others: dict[str, Measurement], chosen: bool) -> None:
+        """Draw one measurement in 3D with its label, coloured by whether it is stale, chosen or neither."""
         lines = drawn(measured, others, self._lines[measured.id][1] if measured.kind == "section" else ())
         if lines is None:
             return

@@ -20,8 +20,10 @@ _STEPS = 400
 
 
 class SectionPlot:
-    """The plot, a slider per cursor, and the values at the cursors; hidden without a section. ``moved()`` is called
-    whenever a cursor was moved."""
+    """Plot of a section, a slider per cursor, and the values at the cursors; hidden without a section.
+
+    ``moved()`` is called whenever a cursor was moved.
+    """
 
     def __init__(self, context: PanelContext, moved: Callable[[], None]) -> None:
         self._id = ""
@@ -35,18 +37,18 @@ class SectionPlot:
         self._values = Text(context.gui)
 
     def set(self, identity: str, lines: list[np.ndarray]) -> None:
-        """Put the cursors on a section's lines (k, 2) mm; they keep their positions on the same section."""
+        """Place the cursors on a section's lines (k, 2) mm; they keep their positions on the same section."""
         if identity == self._id:
             return
         self._id, self._lines = identity, lines
-        low, high, step = _range(np.concatenate(lines)[:, 0])
+        low, high, step = _round_range(np.concatenate(lines)[:, 0])
         for slider, share in zip(self._sliders, _AT, strict=True):
             slider.min, slider.max, slider.step = low, high, step
             slider.value = round(low + round(share * (high - low) / step) * step, 6)
             change(slider, visible=True)
 
     def hide(self) -> None:
-        """Show nothing."""
+        """Hide plot, values and sliders."""
         self._id = ""
         self._plot.hide()
         self._values.set("")
@@ -64,8 +66,8 @@ class SectionPlot:
         self._values.set(cursor_html(cursors))
 
 
-def _range(along: np.ndarray) -> tuple[float, float, float]:
-    """Lowest and highest of positions (n,) mm as round numbers, and a round step."""
+def _round_range(along: np.ndarray) -> tuple[float, float, float]:
+    """Return (lowest, highest, step) of positions (n,) mm as round numbers."""
     low, high = float(along.min()), float(along.max())
     digits = int(np.clip(-np.floor(np.log10(max(high - low, 1e-6) / _STEPS)), 0, 5))
     step = 10.0**-digits
@@ -73,12 +75,12 @@ def _range(along: np.ndarray) -> tuple[float, float, float]:
 
 
 def cursor_points(lines: list[np.ndarray], at: tuple[float, ...]) -> np.ndarray:
-    """(3, 2) mm: the section's points at the cursors."""
+    """Return the section's points (3, 2) mm at the cursors."""
     return np.array([nearest_on_section(lines, x) for x in at])
 
 
 def cursor_html(cursors: np.ndarray) -> Html:
-    """The values at the cursors (3, 2) mm."""
+    """Return a table of distances and radius at the cursors (3, 2) mm."""
     a, b, c = cursors
     rows: list[tuple[object, object]] = [
         (f"{q.name.capitalize()} A – B", f"{q.value:.3f} {q.unit}".replace("-", "−")) for q in measure_cursors(a, b)

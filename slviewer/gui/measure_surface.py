@@ -23,7 +23,7 @@ DEVIATION = "deviation"
 
 
 class SurfaceView:
-    """The chosen surface; ``loaded()`` is called once another one is shown, on the painter's thread."""
+    """View of the chosen surface; ``loaded()`` is called once another one is shown, on the painter's thread."""
 
     def __init__(self, context: PanelContext, painter: Painter, layer: str, loaded: Callable[[], None]) -> None:
         self._context, self._painter, self._layer, self._loaded = context, painter, layer, loaded
@@ -34,7 +34,7 @@ class SurfaceView:
         self.on: MeasuredSurface | None = None
 
     def build(self) -> None:
-        """The inputs."""
+        """Create the inputs."""
         gui, context = self._context.gui, self._context
         self._choice = Choice(gui, "Surface")
         self._choice.on_change(context.callback(self.request))
@@ -49,7 +49,7 @@ class SurfaceView:
         return self._choice.value
 
     def choose(self, name: str) -> None:
-        """Choose this one, if it is offered."""
+        """Choose a surface by name, if it is offered."""
         self._choice.choose(name)
 
     def offer(self, session: SessionView | None) -> None:
@@ -67,7 +67,7 @@ class SurfaceView:
         self.request()
 
     def show_deviation(self, measured: Measurement | None) -> None:
-        """Colour by this deviation; None: by another quantity."""
+        """Colour the surface by this deviation; None: by another quantity."""
         self._deviation = measured
         if measured is not None:
             change(self._colour, options=(*COLOURS, DEVIATION))
@@ -79,18 +79,19 @@ class SurfaceView:
         self.request()
 
     def show(self, visible: bool) -> None:
-        """The panel is shown or hidden."""
+        """Show or hide the surface."""
         self._visible = visible
         self._context.scene.show(self._layer, visible)
         self._show_view()
 
     def pick(self, origin: np.ndarray, direction: np.ndarray, do: Callable[[Place], None]) -> None:
-        """Call ``do(place)`` soon with the point that a ray meets; nothing happens where it misses the surface."""
+        """Call ``do(place)`` later with the point that a ray meets; not called where it misses the surface."""
         on, slot = self.on, f"click {next(self._clicks)}"
         if on is None:
             return
 
         def picked(place: Place | None) -> None:
+            """Pass the place on, unless the ray has missed or another surface is shown by now."""
             self._painter.cancel(slot)
             if place is not None and on is self.on:
                 do(place)
@@ -112,15 +113,17 @@ class SurfaceView:
         context = self._context
 
         def make() -> tuple[MeasuredSurface, np.ndarray, np.ndarray, Html]:
+            """Load the surface; returns (surface, points, colours, legend)."""
             on = context.operator.surface(name)
             if shown is None:
                 return (on, *painting(on, COLOURS[0] if colour == DEVIATION else colour))
             arrays = measurement_arrays(context.session, shown.id)
-            return (on, *_deviating(arrays, shown))
+            return (on, *_colour_by_deviation(arrays, shown))
 
-        self._painter.request("surface", key, make, self._draw)
+        self._painter.request("surface", key, make, self._draw_surface)
 
-    def _draw(self, made: tuple[MeasuredSurface, np.ndarray, np.ndarray, Html]) -> None:
+    def _draw_surface(self, made: tuple[MeasuredSurface, np.ndarray, np.ndarray, Html]) -> None:
+        """Draw the loaded surface and its legend; report a new one."""
         on, points, painted, bar = made
         is_new = on is not self.on
         self.on = on
@@ -132,12 +135,13 @@ class SurfaceView:
         self._show_view()
 
     def _show_view(self) -> None:
+        """Move the browsers' views to the surface, if it is visible."""
         if self._visible and self.on is not None:
             self._context.viewpoints.show(f"{self._layer} {self.on.source}", self.on.points)
 
 
 def painting(on: MeasuredSurface, colour: str) -> tuple[np.ndarray, np.ndarray, Html]:
-    """(points (..., 3), their colours likewise, the legend) of a surface in one of COLOURS."""
+    """Colour a surface by one of COLOURS: (points (..., 3), their colours (..., 3), the legend)."""
     if colour == "texture" and on.texture is not None:
         return on.points, on.texture, Html("")
     if colour == "uncertainty":
@@ -148,8 +152,8 @@ def painting(on: MeasuredSurface, colour: str) -> tuple[np.ndarray, np.ndarray, 
     return on.points, *paint(on.points[..., 2], "mm", 1, "depth")
 
 
-def _deviating(arrays: dict[str, np.ndarray], measured: Measurement) -> tuple[np.ndarray, np.ndarray, Html]:
-    """As `painting`, of a stored deviation; grey where the nominal was not measured."""
+def _colour_by_deviation(arrays: dict[str, np.ndarray], measured: Measurement) -> tuple[np.ndarray, np.ndarray, Html]:
+    """Colour a surface by a stored deviation, as `painting`; grey where the nominal was not measured."""
     verdict = measured.data["verdict"]
     limit = colour_limit(arrays["signed"], None if verdict is None else float(verdict["tolerance_mm"]))
     uncovered = arrays["uncovered"].reshape(-1, 3)

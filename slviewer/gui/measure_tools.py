@@ -17,7 +17,7 @@ _WITHOUT_CLICKS = {
 
 
 class Tool:
-    """The current tool, its name empty for none, and the points picked with it."""
+    """The chosen tool, its name empty for none, and the points picked with it."""
 
     def __init__(self) -> None:
         self.name = ""
@@ -29,12 +29,12 @@ class Tool:
 
     @property
     def fits(self) -> bool:
-        """Whether it fits a shape to a region around the picked point."""
+        """Whether the tool fits a shape to a region around the picked point."""
         return self.name in FIT
 
     @property
     def clicks(self) -> bool:
-        """Whether it waits for clicks on the surface."""
+        """Whether the tool needs clicks on the surface."""
         return self.fits or self.name in _CLICKS
 
     def pick(self, place: Place) -> tuple[Place, ...] | None:
@@ -53,7 +53,7 @@ class Tool:
 
     @property
     def instruction(self) -> str:
-        """What to do now."""
+        """What to do now, in one sentence."""
         if not self.name:
             return "Choose a tool."
         if self.fits:

@@ -19,7 +19,7 @@ _STRAY = {
 
 
 def merge_html(merge: MergeView, labels: Mapping[str, str]) -> Html:
-    """The alignment of the scans, the loops that they close, and the excluded pixels."""
+    """Describe a merge: the alignment of the scans, their loops, and the excluded pixels."""
     onto = sorted(merge.registered, key=lambda pair: merge.reference not in (pair.scan, pair.onto))
     parts = [_pairs_table(onto, labels)]
     if len(merge.scans) == 3:
@@ -34,7 +34,7 @@ def merge_html(merge: MergeView, labels: Mapping[str, str]) -> Html:
             paragraph(Html(f'<details><summary>{title}</summary><ul style="padding-left:1.4em">{pairs}</ul></details>'))
         )
     stale = coloured("Out of date: merge again.", "warning") if merge.stale else ""
-    whole = f"<b>{merge.points:,} points</b> in the frame of {to_html(_label(merge.reference, labels))}"
+    whole = f"<b>{merge.points:,} points</b> in the frame of {to_html(_get_label(merge.reference, labels))}"
     if merge.shared is not None:
         whole += f", {100 * merge.shared:.0f}&nbsp;% measured by several scans"
     parts.append(paragraph(Html(f"{whole}. {stale}")))
@@ -44,14 +44,14 @@ def merge_html(merge: MergeView, labels: Mapping[str, str]) -> Html:
 
 
 def merge_failure_html(why: str, labels: Mapping[str, str], merge: MergeView | None = None) -> Html:
-    """Why the last merge failed; ``merge``: the previous one, which is still shown."""
+    """Describe why the last merge failed; ``merge``: the previous one, which is still shown."""
     still = "" if merge is None else " The previous merge is shown below."
     return alert(Html(f"<b>Not merged.</b> {to_html(use_labels(why, labels) + still)}"), "error")
 
 
 def turntable_html(names: Sequence[str], step_deg: float, labels: Mapping[str, str]) -> Html:
-    """The angle of each scan."""
-    turned = [f"{_label(name, labels)} at {k * step_deg:g}°" for k, name in enumerate(names)]
+    """List the turntable angle of each scan."""
+    turned = [f"{_get_label(name, labels)} at {k * step_deg:g}°" for k, name in enumerate(names)]
     if len(turned) > 4:
         turned = [*turned[:3], "…", turned[-1]]
     note = "Direction and axis of the turntable are estimated."
@@ -59,16 +59,18 @@ def turntable_html(names: Sequence[str], step_deg: float, labels: Mapping[str, s
 
 
 def use_labels(sentence: str, labels: Mapping[str, str]) -> str:
-    """The sentence with the operator's labels in place of the captures' names."""
+    """Replace the captures' names in a sentence by the operator's labels."""
     names = [re.escape(name) for name, label in labels.items() if label != name]
     return re.sub(rf"(?<![\w.-])({'|'.join(names)})(?![\w-])", lambda m: labels[m[1]], sentence) if names else sentence
 
 
-def _label(name: str, labels: Mapping[str, str]) -> str:
+def _get_label(name: str, labels: Mapping[str, str]) -> str:
+    """Return the operator's label of a capture, or its name."""
     return labels.get(name, name)
 
 
 def _pairs_table(pairs: Sequence[MergedPair], labels: Mapping[str, str]) -> Html:
+    """Return a table of the registered pairs: RMS, overlap, standard deviation and motion."""
     rows = []
     for pair in pairs:
         tone: Tone = "good" if pair.overlap >= MIN_OVERLAP else "warning"
@@ -82,11 +84,11 @@ def _pairs_table(pairs: Sequence[MergedPair], labels: Mapping[str, str]) -> Html
             sigma = [f"{pair.sigma_mm:.4f} mm", f"{pair.sigma_deg:.4f}°"]
         rows.append(
             (
-                _lines(_label(pair.scan, labels), f"to {_label(pair.onto, labels)}"),
+                _join_lines(_get_label(pair.scan, labels), f"to {_get_label(pair.onto, labels)}"),
                 coloured(f"{pair.rms_mm:.3f} mm", "plain", bold=True),
                 Html(f"{to_html(f'{100 * pair.overlap:.0f} %')}{meter(pair.overlap, tone)}"),
-                _lines(*sigma),
-                _lines(*moved),
+                _join_lines(*sigma),
+                _join_lines(*moved),
             )
         )
     html = table(("Scan", "RMS", "Overlap", "Sigma", "Motion"), rows)
@@ -94,7 +96,7 @@ def _pairs_table(pairs: Sequence[MergedPair], labels: Mapping[str, str]) -> Html
 
 
 def _letter_html(merge: MergeView) -> Html:
-    """The Letter's figures for its own three scans."""
+    """Compare the point-to-point RMS with the Letter's for its own three scans."""
     theirs = " and ".join(f"{mm:.2f}" for mm in letter.EXPERIMENT_3_ICP_RMS_MM.values())
     ours = [pair.point_mm for pair in merge.registered if merge.reference in (pair.scan, pair.onto)]
     here = " and ".join(f"{mm:.2f}" for mm in ours if mm is not None)
@@ -103,21 +105,23 @@ def _letter_html(merge: MergeView) -> Html:
 
 
 def _loops_table(loops: Sequence[MergedLoop], labels: Mapping[str, str]) -> Html:
+    """Return a table of the worst loops: closure error before and after the joint adjustment."""
     rows = []
     for loop in loops[:_MOST_LOOPS]:
-        through = [_label(name, labels) for name in loop.scans]
+        through = [_get_label(name, labels) for name in loop.scans]
         if len(through) > 4:
             through = [*through[:2], "…", through[-1]]
         rows.append(
             (
                 " – ".join([*through, through[0]]),
-                _lines(f"{loop.error_mm:.3f} mm", f"{loop.error_deg:.4f}°"),
-                _lines(f"{loop.adjusted_mm:.3f} mm", f"{loop.adjusted_deg:.4f}°"),
+                _join_lines(f"{loop.error_mm:.3f} mm", f"{loop.error_deg:.4f}°"),
+                _join_lines(f"{loop.adjusted_mm:.3f} mm", f"{loop.adjusted_deg:.4f}°"),
             )
         )
     worst = f" (worst of {len(loops)})" if len(loops) > 1 else ""
     return table((f"Loop closure{worst}", "Before", "After"), rows)
 
 
-def _lines(*texts: str) -> Html:
+def _join_lines(*texts: str) -> Html:
+    """Join texts by HTML line breaks."""
     return Html("<br>".join(map(to_html, texts)))

@@ -36,19 +36,21 @@ _BALL = 0.022
 
 @dataclass
 class _Picks:
-    """Pairs of points (3,) mm on a scan and on the reference, and the one that waits for its counterpart."""
+    """Pairs of points (3,) mm on a scan and on the reference, and a point without counterpart yet."""
 
     versions: tuple[Any, Any]
     pairs: list[dict[Side, np.ndarray]] = field(default_factory=list)
     begun: dict[Side, np.ndarray] = field(default_factory=dict)
 
     def add(self, side: Side, point: np.ndarray) -> None:
+        """Add a point on one cloud; it replaces a waiting one there, or completes a pair."""
         self.begun[side] = point  # a second click on the same cloud corrects the first
         if len(self.begun) == len(_SIDES):
             self.pairs.append(self.begun)
             self.begun = {}
 
     def undo(self) -> None:
+        """Remove the waiting point, else the last pair."""
         if self.begun:
             self.begun = {}
         elif self.pairs:
@@ -56,13 +58,14 @@ class _Picks:
 
     @property
     def points(self) -> tuple[np.ndarray, np.ndarray]:
+        """The points (n, 3) mm of the pairs, on the scan and on the reference."""
         scan, onto = (np.array([pair[side] for pair in self.pairs]).reshape(-1, 3) for side in _SIDES)
         return scan, onto
 
 
 @dataclass(frozen=True, eq=False)
 class _SideBySide:
-    """The two clouds (h, w, 3) mm in their cameras' frames, the shift of the scan to be drawn beside, and the width."""
+    """Two clouds (h, w, 3) mm in their cameras' frames, the shift that draws the scan beside, and the width."""
 
     pair: Pair
     clouds: Mapping[Side, np.ndarray]
@@ -71,17 +74,18 @@ class _SideBySide:
     wide_mm: float
 
     def offset(self, side: Side) -> np.ndarray:
+        """Return the shift (3,) mm at which a cloud is drawn."""
         return self.shift if side == "scan" else np.zeros(3)
 
     @cached_property
     def points(self) -> np.ndarray:
-        """(n, 3) mm: both clouds as they are drawn, with a margin for narrow windows."""
+        """Both clouds as they are drawn, (n, 3) mm, with a margin for narrow windows."""
         points = np.concatenate([(self.clouds[side][::4, ::4] + self.offset(side)).reshape(-1, 3) for side in _SIDES])
         middle = np.nanmean(points, axis=0)
         return np.asarray(middle + _MARGIN * (points - middle), np.float32)
 
     def hit(self, origin: np.ndarray, direction: np.ndarray) -> tuple[Side, np.ndarray] | None:
-        """The cloud that a ray meets first, and the point (3,) on it."""
+        """Return the cloud that a ray meets first, and the point (3,) mm on it; None where it misses both."""
         met = []
         for side in _SIDES:
             index = nearest(self.clouds[side], origin - self.offset(side), direction)
@@ -92,7 +96,7 @@ class _SideBySide:
 
 
 class PointPicker:
-    """Inputs and 3D view for picking; ``changed()`` is called after every accepted click."""
+    """Inputs and 3D view to pick points; ``changed()`` is called after every accepted click."""
 
     def __init__(self, context: PanelContext, painter: Painter, changed: Callable[[], None]) -> None:
         self._context, self._painter, self._changed = context, painter, changed
@@ -108,6 +112,7 @@ class PointPicker:
         self._on: bool | None = None
 
     def build(self) -> None:
+        """Create the inputs."""
         gui, context = self._context.gui, self._context
         self._scan = Choice(gui, "Scan", "To be picked on together with the reference")
         self._scan.on_change(context.callback(self._changed))
@@ -116,7 +121,7 @@ class PointPicker:
         self._undo = context.button("Undo last point", self._undo_point, viser.Icon.ARROW_BACK_UP, visible=False)
 
     def offer(self, versions: Mapping[str, Any], reference: str, labels: Mapping[str, str], on: bool) -> None:
-        """Offer the scans to be merged, {name: what its cloud depends on}; ``on``: show the inputs."""
+        """Offer the scans to merge, {name: version of its cloud}; ``on``: show the inputs. Drops outdated points."""
         with self._lock:
             self._labels, self._reference = labels, reference
             self._names = [name for name in versions if name != reference]
@@ -135,23 +140,23 @@ class PointPicker:
 
     @property
     def is_ready(self) -> bool:
-        """Whether a scan has enough pairs, and none has too few."""
-        counts = [len(picks.pairs) for picks in self._current()]
+        """Whether at least one scan has enough pairs, and none has too few."""
+        counts = [len(picks.pairs) for picks in self._list_current_picks()]
         return max(counts, default=0) >= LEAST_PICKS and not any(0 < n < LEAST_PICKS for n in counts)
 
     def picked(self) -> dict[Pair, tuple[np.ndarray, np.ndarray]]:
-        """The points (n, 3) mm on the scan and on the reference, by pair."""
+        """Return the points (n, 3) mm on the scan and on the reference, by pair."""
         with self._lock:
             pairs = [(name, self._reference) for name in self._names]
             return {pair: self._picks[pair].points for pair in pairs if self._picks[pair].pairs}
 
     def show(self, on: bool) -> None:
-        """Draw the two clouds and react to clicks, or neither."""
+        """Draw the two clouds and react to clicks, or stop both."""
         with self._lock:
             scene = self._context.scene
             if on != self._on:
                 if on or self._on:  # otherwise the clicks may be another step's
-                    scene.on_pick(self._click if on else None)
+                    scene.on_pick(self._handle_click if on else None)
                 self._on = on
                 scene.show(LAYER, on)
             self._draw_note(self._offered)
@@ -159,21 +164,25 @@ class PointPicker:
             if not on or pair is None:
                 return
             key = (pair, self._picks[pair].versions)
-            self._painter.request("picks", key, lambda: _side_by_side(self._context.session, pair), self._draw)
-            self._mark()
+            self._painter.request(
+                "picks", key, lambda: _load_side_by_side(self._context.session, pair), self._draw_clouds
+            )
+            self._draw_marks()
             self._show_view()
 
     @property
     def points(self) -> np.ndarray | None:
-        """The shown points (n, 3) mm."""
+        """The shown points (n, 3) mm; None where none are."""
         return None if self._shown is None else self._shown.points
 
     @property
     def _pair(self) -> Pair | None:
+        """The chosen scan and the reference; None where they cannot be picked on."""
         pair = self._scan.value, self._reference
         return pair if pair in self._picks else None
 
-    def _current(self) -> Sequence[_Picks]:
+    def _list_current_picks(self) -> Sequence[_Picks]:
+        """List the picks of all offered scans with the current reference."""
         with self._lock:
             return [
                 self._picks[name, self._reference] for name in self._names if (name, self._reference) in self._picks
@@ -181,21 +190,23 @@ class PointPicker:
 
     # drawing
 
-    def _draw(self, shown: _SideBySide) -> None:
+    def _draw_clouds(self, shown: _SideBySide) -> None:
+        """Draw the two loaded clouds side by side with their marks."""
         with self._lock:
             self._shown = shown
             for side in _SIDES:
                 self._context.scene.cloud(LAYER, side, shown.clouds[side] + shown.offset(side), shown.colours[side])
             self._context.scene.show(LAYER, bool(self._on))
-            self._mark()
+            self._draw_marks()
             self._show_view()
 
     def _show_view(self) -> None:
+        """Move the browsers' views to the two clouds, if they are shown."""
         shown = self._shown
         if self._on and shown is not None and shown.pair == self._pair:
             self._context.viewpoints.show(f"{LAYER} {shown.pair}", shown.points)
 
-    def _mark(self) -> None:
+    def _draw_marks(self) -> None:
         """Draw the numbered points on both clouds."""
         shown, scene = self._shown, self._context.scene
         wanted: dict[str, tuple[np.ndarray, str, Side]] = {}
@@ -213,7 +224,7 @@ class PointPicker:
         self._marked = {name: tuple(point) for name, (point, _, _) in wanted.items()}
 
     def _draw_note(self, on: bool) -> None:
-        """What to click next, and the residuals of the pairs."""
+        """Show what to click next, and the residuals of the pairs."""
         pair = self._pair
         if not on or pair is None:
             self._note.set("")
@@ -222,13 +233,14 @@ class PointPicker:
             return
         picks = self._picks[pair]
         if self._on:
-            self._note.set(alert(self._instruction(pair, picks), "info"))
+            self._note.set(alert(self._format_instruction(pair, picks), "info"))
         else:
             self._note.write("To pick more, choose the 3D view side by side.", "dim")
         self._table.set(_residuals_html(picks) + self._counts_html())
         change(self._undo, visible=bool(picks.pairs or picks.begun))
 
-    def _instruction(self, pair: Pair, picks: _Picks) -> Html:
+    def _format_instruction(self, pair: Pair, picks: _Picks) -> Html:
+        """Describe the next click for a pair of scans."""
         names = {
             side: f"{patch(_MARKS[side])} <b>{to_html(self._labels.get(name, name))}</b> {_WHERE[side]}"
             for side, name in zip(_SIDES, pair, strict=True)
@@ -245,8 +257,8 @@ class PointPicker:
         )
 
     def _counts_html(self) -> Html:
-        """The number of pairs of each scan."""
-        if len(self._names) < 2 or not any(picks.pairs for picks in self._current()):
+        """List the number of pairs of each scan; empty for a single one."""
+        if len(self._names) < 2 or not any(picks.pairs for picks in self._list_current_picks()):
             return Html("")
         parts = []
         for name in self._names:
@@ -257,12 +269,14 @@ class PointPicker:
 
     # clicks
 
-    def _click(self, origin: np.ndarray, direction: np.ndarray) -> None:
+    def _handle_click(self, origin: np.ndarray, direction: np.ndarray) -> None:
+        """Add the point that a clicked ray meets, computed on the painter's thread."""
         shown, slot = self._shown, f"click {next(self._clicks)}"
         if shown is None:
             return
 
         def add(met: tuple[Side, np.ndarray] | None) -> None:
+            """Add the point that was met, unless another pair is shown by now."""
             self._painter.cancel(slot)
             with self._lock:
                 if met is None or shown.pair != self._pair or not self._on:
@@ -273,6 +287,7 @@ class PointPicker:
         self._painter.request(slot, None, lambda: shown.hit(origin, direction / np.linalg.norm(direction)), add)
 
     def _undo_point(self) -> None:
+        """Remove the last point or pair of the shown scans."""
         with self._lock:
             if (pair := self._pair) is not None:
                 self._picks[pair].undo()
@@ -280,7 +295,7 @@ class PointPicker:
 
 
 def _residuals_html(picks: _Picks) -> Html:
-    """The residual distance of each pair after the best rigid alignment."""
+    """Return a table of the residual distance of each pair after the best rigid alignment."""
     n = len(picks.pairs)
     if n < LEAST_PICKS:
         return paragraph(coloured(f"{n} of {LEAST_PICKS} pairs picked", "dim"))
@@ -292,8 +307,8 @@ def _residuals_html(picks: _Picks) -> Html:
     return table(("Residual, mm", f"RMS {np.sqrt(np.mean(residuals_mm**2)):.2f}"), rows)
 
 
-def _side_by_side(session: Session, pair: Pair) -> _SideBySide:
-    """The scan moved to the left of the reference, at the same distance from the first viewpoint."""
+def _load_side_by_side(session: Session, pair: Pair) -> _SideBySide:
+    """Load two scans, the first moved to the left of the reference, at the same distance from the viewpoint."""
     clouds: dict[Side, ScanCloud] = {side: scan_cloud(session, name) for side, name in zip(_SIDES, pair, strict=True)}
     flat = {side: cloud.points[np.isfinite(cloud.points[..., 2])].astype(np.float64) for side, cloud in clouds.items()}
     wide = max(float(np.ptp(np.percentile(points @ TO_THE_RIGHT, [1, 99]))) for points in flat.values())

@@ -27,7 +27,7 @@ SHOWN = 60_000
 
 @dataclass(frozen=True, eq=False)
 class ColouredClouds:
-    """Clouds by name, each its points (..., 3) mm and colours; the legend; ``view`` changes with their positions."""
+    """Clouds by name, points (..., 3) mm and colours each, with a legend; `view` changes with their positions."""
 
     view: str
     clouds: Mapping[str, tuple[np.ndarray, np.ndarray | Colour]]
@@ -35,39 +35,42 @@ class ColouredClouds:
 
     @cached_property
     def points(self) -> np.ndarray | None:
-        """All points; None where there are none."""
+        """All points (n, 3) mm; None where there are none."""
         return np.concatenate([points.reshape(-1, 3) for points, _ in self.clouds.values()]) if self.clouds else None
 
 
 def colour_scans(
     session: Session, names: Sequence[str], places: Mapping[str, np.ndarray], titles: Mapping[str, str]
 ) -> ColouredClouds:
-    """Scans, each in a colour, where ``places`` (4, 4) put them, or where they were measured."""
+    """Load scans, each in a colour, at their ``places`` (4, 4), or as captured where they have none."""
     clouds: dict[str, tuple[np.ndarray, np.ndarray | Colour]] = {}
     for i, name in enumerate(names):
         cloud = result_views.scan_cloud(session, name)
         T = places.get(name, np.eye(4))
         clouds[name] = ((cloud.points @ T[:3, :3].T + T[:3, 3]).astype(np.float32), SCAN_COLOURS[i % len(SCAN_COLOURS)])
-    return ColouredClouds("after" if places else "before", clouds, _patches([titles.get(name, name) for name in names]))
+    return ColouredClouds(
+        "after" if places else "before", clouds, _format_patches([titles.get(name, name) for name in names])
+    )
 
 
 def colour_merge(session: Session, merge: str, view: str, titles: Sequence[str]) -> ColouredClouds:
-    """The surface of a merge, in one of MERGED; ``titles`` are those of its scans, in their order."""
+    """Load the surface of a merge, coloured by one of MERGED; ``titles`` are those of its scans, in order."""
     surface = result_views.merged_cloud(session, merge)
-    legend, painted = _painted(surface, view, titles)
+    legend, painted = _colour_surface(surface, view, titles)
     return ColouredClouds("merged", {"merged": (surface.points, painted)}, legend)
 
 
 def patch(colour: Colour) -> Html:
-    """A square of a colour, for a legend."""
+    """Return a square of a colour, for a legend."""
     return Html(f'<span style="color:rgb{colour};font-size:1.3em">■</span>')
 
 
-def _painted(surface: Ply, view: str, titles: Sequence[str]) -> tuple[Html, np.ndarray | Colour]:
+def _colour_surface(surface: Ply, view: str, titles: Sequence[str]) -> tuple[Html, np.ndarray | Colour]:
+    """Return (legend, colours) of a merged surface by texture, scan or uncertainty; grey where not stored."""
     source, sigma, own = surface.scalars.get("source"), surface.scalars.get("sigma"), surface.colours
     if view == BY_SCAN and source is not None:
         palette = np.array(SCAN_COLOURS, np.uint8)
-        return _patches(titles), palette[source.astype(np.int64) % len(palette)]
+        return _format_patches(titles), palette[source.astype(np.int64) % len(palette)]
     if view == BY_SIGMA and sigma is not None:
         known = np.where(sigma > 0, sigma, np.nan)
         title = "uncertainty along the normal (1 sigma)" + ("" if np.isfinite(known).all() else "; grey: unknown")
@@ -79,7 +82,8 @@ def _painted(surface: Ply, view: str, titles: Sequence[str]) -> tuple[Html, np.n
     return paragraph(coloured(missing, "warning")), _GREY
 
 
-def _patches(titles: Sequence[str]) -> Html:
+def _format_patches(titles: Sequence[str]) -> Html:
+    """Return a legend with a coloured square and a title for each scan."""
     items = [
         f"<span>{patch(SCAN_COLOURS[i % len(SCAN_COLOURS)])} {to_html(title)}</span>" for i, title in enumerate(titles)
     ]

@@ -26,7 +26,7 @@ ButtonColour = Literal["gray", "red", "orange", "green", "teal", "cyan"]
 
 @dataclass(frozen=True)
 class PanelContext:
-    """What a panel works with.
+    """Services that a panel uses.
 
     `gui` builds inputs, `scene` draws in 3D, `viewpoints` moves the browsers' views, `operator` takes requests.
     `offer(path)` returns the address at which a file of the session is downloaded; `notify(level, text)` shows a
@@ -49,13 +49,13 @@ class PanelContext:
 
     @property
     def session(self) -> Session:
-        """The open session. Raises InputError where it was closed meanwhile."""
+        """The open session. Raises InputError where none is open."""
         if self.operator.session is None:
             raise InputError("no session is open: open one first")
         return self.operator.session
 
     def callback(self, do: Callable[[], Any], *, by_user: bool = False, at_once: bool = False) -> Callable[[Any], None]:
-        """A callback for viser that calls `do()`; whatever it raises becomes a notification.
+        """Wrap `do()` as a callback for viser; whatever it raises becomes a notification.
 
         Viser calls back from a pool of threads, several events at a time: here they are queued, so that the board is
         placed before it is captured by someone who clicks fast. `by_user`: only for changes made in a browser, not by
@@ -63,12 +63,14 @@ class PanelContext:
         """
 
         def call() -> None:
+            """Call `do()`, and report what it raises."""
             try:
                 do()
             except Exception as error:
                 self.failed(error)
 
         def handle(event: Any) -> None:
+            """Queue the call for an event, or call at once."""
             if by_user and event.client_id is None:
                 return
             if at_once:
@@ -90,15 +92,16 @@ class PanelContext:
         visible: bool = True,
         at_once: bool = False,
     ) -> viser.GuiButtonHandle:
-        """A button that calls `do()`; without a colour it is the panel's main action."""
+        """Add a button that calls `do()`; without a colour it is the panel's main action."""
         handle = self.gui.add_button(label, icon=icon, color=color, hint=hint, visible=visible)
         handle.on_click(self.callback(do, at_once=at_once))
         return handle
 
     def view_button(self, points: Callable[[], np.ndarray | None]) -> viser.GuiButtonHandle:
-        """A button that moves the view of whoever clicks it to the points (..., 3) mm, if there are any."""
+        """Add a button that moves the clicking browser's view to the points (..., 3) mm, if there are any."""
 
         def look(event: Any) -> None:
+            """Move the view of the browser that clicked to the points."""
             shown = points()
             if event.client is not None and shown is not None:
                 look_at_points(event.client, shown)
@@ -109,7 +112,7 @@ class PanelContext:
 
 
 class StepPanel:
-    """One step's controls. Every method is called by the drawing thread, and only handles that changed are touched."""
+    """Base of the steps' panels. Every method is called by the drawing thread; only changed handles are set."""
 
     key: ClassVar[str]
     layers: ClassVar[tuple[str, ...]] = ()
@@ -128,14 +131,14 @@ class StepPanel:
         raise NotImplementedError
 
     def draw(self, snapshot: Snapshot) -> None:
-        """Show this. Called whenever the snapshot changed while the panel is shown, and right after `show(True)`."""
+        """Show a snapshot; called after each change while the panel is shown, and right after `show(True)`."""
         raise NotImplementedError
 
     def draw_preview(self, preview: PreviewView) -> None:
         """Show the latest frame; called while the panel is shown, at most ten times a second."""
 
     def show(self, visible: bool) -> None:
-        """The panel is shown or hidden: so are its layers of the scene."""
+        """Show or hide the panel's layers of the scene."""
         self._visible = visible
         for layer in self.layers:
             self._scene.show(layer, visible)

@@ -19,7 +19,7 @@ PLOT_PX = 440
 
 
 class Painter:
-    """Makes what one panel requests, each for a slot; a newer request for a slot replaces a waiting one.
+    """Computes the pictures of one panel on a thread, by slots; a newer request for a slot replaces a waiting one.
 
     `failed(error)` is called for failures. The thread begins with the first request, and ends with the program.
     """
@@ -32,7 +32,7 @@ class Painter:
         self._thread: threading.Thread | None = None
 
     def request(self, slot: str, key: Hashable, make: Callable[[], Any], show: Callable[[Any], None]) -> None:
-        """Call `show(make())` soon, on the painter's thread, unless `slot` already shows or awaits the same `key`.
+        """Call `show(make())` on the painter's thread, unless `slot` already shows or awaits the same `key`.
 
         `key` is what the picture depends on. `show` is not called if another request for the slot came meanwhile.
         """
@@ -47,12 +47,13 @@ class Painter:
             self._condition.notify_all()
 
     def cancel(self, slot: str) -> None:
-        """Drop the request for a slot; the next one is made whatever its key."""
+        """Drop the request for a slot; the next one is computed whatever its key."""
         with self._condition:
             self._requested.pop(slot, None)
             self._waiting.pop(slot, None)
 
     def _serve(self) -> None:
+        """Compute and show the waiting requests, one after the other; failures are reported."""
         while True:
             with self._condition:
                 self._condition.wait_for(lambda: self._waiting)
@@ -69,7 +70,7 @@ class Painter:
 
 
 class Plot:
-    """A figure in a panel with its caption below; hidden until there is one."""
+    """A figure in a panel with its caption below; hidden while there is none."""
 
     def __init__(self, gui: viser.GuiApi, label: str | None = None) -> None:
         blank = np.full((8, 2 * PLOT_PX, 3), 255, np.uint8)
@@ -77,7 +78,7 @@ class Plot:
         self._caption = Text(gui)
 
     def set(self, figure: Figure | None, caption: str | None = None) -> None:
-        """Show a figure, with its own caption or another; None: nothing."""
+        """Show a figure, with its own caption or another one; None: hide it."""
         if figure is None:
             self.hide()
             return
@@ -86,7 +87,7 @@ class Plot:
         self._caption.set(paragraph(coloured(figure.caption if caption is None else caption, "dim")))
 
     def hide(self) -> None:
-        """Show nothing."""
+        """Hide figure and caption."""
         if self._image.visible:
             self._image.visible = False
         self._caption.set("")

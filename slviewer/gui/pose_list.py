@@ -31,7 +31,7 @@ _PICTURE_PX = 160
 
 
 def pose_table(poses: Sequence[PoseView]) -> Html:
-    """All poses, the latest first, with the state of each and its reason."""
+    """List all poses, the latest first, with their state and its reason."""
     if not poses:
         return paragraph(coloured("None yet.", "dim"))
     rows = []
@@ -49,14 +49,14 @@ def pose_table(poses: Sequence[PoseView]) -> Html:
 
 
 class PoseBoards:
-    """Keeps a layer's boards up to date with the poses; `chosen(name)` is called when one is clicked."""
+    """Draws the boards of the poses in a layer; `chosen(name)` is called when one is clicked."""
 
     def __init__(self, scene: ViewerScene, layer: str, chosen: Callable[[str], None]) -> None:
         self._scene, self._layer, self._chosen = scene, layer, chosen
         self._drawn: dict[str, Any] = {}
 
     def draw(self, poses: Sequence[PoseView], board: Board | None, camera: tuple[int, int] | None, chosen: str) -> None:
-        """Show the poses whose position is known."""
+        """Draw the boards of the poses whose position is known; the chosen one has a thicker outline."""
         known = {pose.name: pose for pose in poses if pose.T_camera_board is not None} if board is not None else {}
         for name in set(self._drawn) - set(known):
             self._scene.remove(self._layer, name)
@@ -80,7 +80,7 @@ class PoseBoards:
 
 
 def rectified(pose: PoseView, board: Board, camera: tuple[int, int] | None) -> np.ndarray | None:
-    """(h, w, 3) uint8: the board's front, cut out of the pose's thumbnail; None where either is unknown."""
+    """Cut the board's front (h, w, 3) uint8 out of a pose's thumbnail; None where either is unknown."""
     if not pose.thumbnail or pose.board_px is None or camera is None:
         return None
     image = cv2.imdecode(np.frombuffer(pose.thumbnail, np.uint8), cv2.IMREAD_COLOR)

@@ -13,8 +13,9 @@ DIM = 0.35
 
 
 def draw_preview(preview: PreviewView, board: Board | None = None, ghost_px: np.ndarray | None = None) -> np.ndarray:
-    """(h, w, 3) uint8: the frame with saturated pixels marked, the detected board's features joined row by row, and the
-    outline (4, 2), in camera px, of the suggested pose.
+    """Draw the frame (h, w, 3) uint8 with saturated pixels, the detected board and the suggested outline marked.
+
+    The board's features are joined row by row; `ghost_px` is the outline (4, 2) of the suggested pose, in camera px.
     """
     picture = fitted(preview.image)
     clipped = preview.image >= 255
@@ -23,16 +24,16 @@ def draw_preview(preview: PreviewView, board: Board | None = None, ghost_px: np.
         picture[mask > 0] = _CLIPPED
     to_picture = preview.scale * PICTURE_PX / preview.image.shape[1]
     if ghost_px is not None and np.isfinite(ghost_px).all():
-        _dashed(picture, ghost_px * to_picture)
+        _draw_dashed_outline(picture, ghost_px * to_picture)
     if preview.board is not None:
-        _grid(picture, preview.board.pixels * to_picture, board)
+        _draw_features(picture, preview.board.pixels * to_picture, board)
         corners = np.round(preview.board.outline * to_picture * 16).astype(np.int32)
         cv2.polylines(picture, [corners], True, _DETECTED, 2, cv2.LINE_AA, shift=4)
     return picture
 
 
 def exposure_html(preview: PreviewView) -> Html:
-    """Whether the frame is well exposed, and what to do."""
+    """Describe whether the frame is well exposed, and what to do."""
     if preview.saturated > 0.002:
         share = 100 * preview.saturated
         return coloured(f"{share:.1f} % saturated (red): lower the exposure", "error", bold=True)
@@ -42,7 +43,7 @@ def exposure_html(preview: PreviewView) -> Html:
 
 
 def board_html(preview: PreviewView, board: Board | None) -> Html:
-    """Whether the board is detected, and why not."""
+    """Describe whether the board is detected, or why not."""
     if board is None:
         return coloured("No board is chosen", "dim")
     if preview.board is None:
@@ -53,7 +54,7 @@ def board_html(preview: PreviewView, board: Board | None) -> Html:
 
 
 def legend(preview: PreviewView, *lines: Html) -> Html:
-    """Lines below the image, the frame rate beside the first."""
+    """Return lines below the image, the frame rate beside the first."""
     rate = coloured(f"{preview.frames_per_s:.0f} frames/s", "dim")
     first = (
         '<div style="display:flex;justify-content:space-between;gap:1em">'
@@ -63,7 +64,7 @@ def legend(preview: PreviewView, *lines: Html) -> Html:
 
 
 def histogram_chart(preview: PreviewView) -> Html:
-    """Grey levels from dark to bright; bars that reach the right end are clipped light."""
+    """Return a bar chart of the grey levels; the last bar is red: saturated pixels."""
     shares = np.sqrt(preview.histogram / max(float(preview.histogram.max()), 1e-9))  # the few bright pixels matter most
     bars = "".join(
         f'<rect x="{4 * k}" y="{40 - 40 * share:.1f}" width="3.4" height="{40 * share:.1f}" '
@@ -84,7 +85,8 @@ def histogram_chart(preview: PreviewView) -> Html:
     )
 
 
-def _grid(picture: np.ndarray, pixels: np.ndarray, board: Board | None) -> None:
+def _draw_features(picture: np.ndarray, pixels: np.ndarray, board: Board | None) -> None:
+    """Draw the detected features (n, 2) px, joined row by row where all were detected."""
     at = np.round(pixels * 16).astype(np.int32)
     if board is not None and len(pixels) == len(board.points):
         columns = board.features[0]
@@ -94,7 +96,8 @@ def _grid(picture: np.ndarray, pixels: np.ndarray, board: Board | None) -> None:
         cv2.circle(picture, (int(point[0]), int(point[1])), 40, _DETECTED, -1, cv2.LINE_AA, shift=4)
 
 
-def _dashed(picture: np.ndarray, corners: np.ndarray) -> None:
+def _draw_dashed_outline(picture: np.ndarray, corners: np.ndarray) -> None:
+    """Draw a closed dashed outline through corners (n, 2) px."""
     for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
         dashes = max(2, int(np.linalg.norm(end - start) / 14))
         for k in range(dashes):

@@ -18,7 +18,7 @@ _EXPOSURES: dict[str, tuple[float, ...]] = {
 
 
 class RigCheck:
-    """The part of the step Rig below the image: the check, and the exposures of captures."""
+    """Inputs of the step Rig for its check and the exposures of captures."""
 
     def __init__(self, context: PanelContext) -> None:
         self._context = context
@@ -42,7 +42,7 @@ class RigCheck:
         self._linear.on_update(context.callback(lambda: operator.set_linear_light(self._linear.value), by_user=True))
 
     def draw(self, snapshot: Snapshot) -> None:
-        """Show the last results."""
+        """Show the result of the last check, and the session's exposures."""
         session, result, rig = snapshot.session, snapshot.preflight, snapshot.rig
         recorded = rig.choice is not None and rig.choice.get("driver") == "replay"  # a recording cannot be checked
         change(self._check, disabled=rig.state != "open" or rig.capture is not None or recorded)
@@ -65,11 +65,13 @@ class RigCheck:
             self._results.set(checks_table(result) if result else "")
 
     def _set_exposures(self) -> None:
+        """Request the chosen multiples of the current exposure."""
         now = self._context.operator.snapshot().rig.exposure_ms
         if now is not None:
             self._context.operator.set_exposures([now * times for times in _EXPOSURES[self._exposures.value]])
 
     def _set_exposure(self) -> None:
+        """Request the exposure that the check recommends."""
         result = self._context.operator.snapshot().preflight
         if result is not None and result.exposure_ms is not None:
             self._context.operator.set_exposure(result.exposure_ms)
@@ -79,7 +81,7 @@ _ROW = "display:flex;gap:0.6em;padding:0.3em 0;border-top:1px solid var(--mantin
 
 
 def checks_table(result: Preflight) -> Html:
-    """Each check in its colour, with its remedy."""
+    """List each check in its colour, with its remedy."""
     lines = []
     for check in result.checks:
         mark = coloured(_MARKS[check.verdict], _TONES[check.verdict], bold=True)

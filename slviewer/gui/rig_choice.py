@@ -27,7 +27,7 @@ _ADDRESSES = ("source", "serial")
 
 
 class RigChoice:
-    """The part of the step Rig that chooses the devices."""
+    """Inputs of the step Rig that choose the devices."""
 
     def __init__(self, context: PanelContext) -> None:
         self._context = context
@@ -36,9 +36,9 @@ class RigChoice:
         gui = context.gui
         self._choice: Any = gui.add_dropdown("Rig", (_CHOOSE, *SIMULATED, _CUSTOM))
         self._chosen_value = SessionValue(self._choice)
-        self._choice.on_update(context.callback(self._choose, by_user=True))
+        self._choice.on_update(context.callback(self._request_choice, by_user=True))
         self._status = Text(gui)
-        self._retry = context.button("Try again", self._use_again, viser.Icon.REFRESH, None, visible=False)
+        self._retry = context.button("Try again", self._request_again, viser.Icon.REFRESH, None, visible=False)
         with gui.add_folder("Devices", visible=False) as self._devices:
             self._cameras = _label_drivers([d for d in available() if d.camera])
             self._projectors = _label_drivers([d for d in available() if d.projector])
@@ -51,7 +51,7 @@ class RigChoice:
             self._missing = Text(gui)
             self._use = context.button(
                 "Use these devices",
-                lambda: context.operator.choose_rig(self._entered()),
+                lambda: context.operator.choose_rig(self._read_entered()),
                 viser.Icon.PLUG_CONNECTED,
                 None,
             )
@@ -71,15 +71,15 @@ class RigChoice:
             context.button("Save", lambda: context.operator.save_rig(self._name.value), viser.Icon.DEVICE_FLOPPY)
         self._needs_page = False
         self._draw_devices()
-        self._offer()
+        self._offer_rigs()
 
     def draw(self, snapshot: Snapshot) -> None:
         """Show the rig in use, and offer the others."""
         if snapshot.session is not self._session:  # its own rigs may have changed
             self._session = snapshot.session
-            self._offer()
+            self._offer_rigs()
         rig = snapshot.rig
-        self._chosen_value.update(self._chosen(rig))
+        self._chosen_value.update(self._match_option(rig))
         preset = self._presets.get(self._choice.value)
         about = "" if preset is None else paragraph(coloured(preset.problem or preset.what, "dim"))
         self._status.set(about + _rig_html(rig))
@@ -89,7 +89,8 @@ class RigChoice:
         self._needs_page = rig.needs_page
         self._draw_page()
 
-    def _offer(self) -> None:
+    def _offer_rigs(self) -> None:
+        """Update the options from the rig presets; a choice that is no longer offered is reset."""
         session = self._context.operator.session
         self._presets = {p.name: p for p in presets(session) if p.choice.get("driver") != "simulated"}
         options = (_CHOOSE, *SIMULATED, *self._presets, _CUSTOM)
@@ -98,8 +99,8 @@ class RigChoice:
             self._choice.options = options
             self._choice.value = value if value in options else _CHOOSE
 
-    def _chosen(self, rig: RigView) -> str:
-        """The option that gave this rig."""
+    def _match_option(self, rig: RigView) -> str:
+        """Return the option that gave this rig."""
         if rig.choice is None:
             return _CHOOSE
         if rig.choice.get("driver") == "simulated":
@@ -107,9 +108,10 @@ class RigChoice:
             return next((label for label, rig in SIMULATED.items() if rig["scale"] == scale), _CHOOSE)
         if rig.choice.get("driver") == _REPLAY:
             return _REPLAY
-        return next((name for name, p in self._presets.items() if _same(p.choice, rig.choice)), _CUSTOM)
+        return next((name for name, p in self._presets.items() if _is_same_rig(p.choice, rig.choice)), _CUSTOM)
 
-    def _choose(self) -> None:
+    def _request_choice(self) -> None:
+        """Request the chosen rig; where it is refused, show the one in use again."""
         chosen = self._choice.value
         self._draw_folders()
         operator, preset = self._context.operator, self._presets.get(chosen)
@@ -123,24 +125,28 @@ class RigChoice:
         else:
             granted = operator.choose_rig(preset.choice)
         if not granted:  # show what is in use; the other can be chosen again
-            self._choice.value = self._chosen(operator.snapshot().rig)
+            self._choice.value = self._match_option(operator.snapshot().rig)
             self._draw_folders()
 
-    def _use_again(self) -> None:
+    def _request_again(self) -> None:
+        """Request the current rig again."""
         choice = self._context.operator.snapshot().rig.choice
         if choice is not None:
             self._context.operator.choose_rig(choice)
 
     def _draw_folders(self) -> None:
+        """Show the inputs for custom devices or a recording, as chosen."""
         change(self._devices, visible=self._choice.value == _CUSTOM)
         change(self._recording, visible=self._choice.value == _REPLAY)
         self._draw_page()
 
     def _draw_page(self) -> None:
+        """Show the state of the projector page where the rig needs it."""
         own = self._choice.value == _CUSTOM and self._projectors[self._projector.value].channel
         self._page.set(_page_html(self._context.projector_page()) if self._needs_page or own else "")
 
     def _draw_devices(self) -> None:
+        """Show what the chosen drivers lack, and whether the camera needs an identifier."""
         chosen = (self._cameras[self._camera.value], self._projectors[self._projector.value])
         missing = "; ".join(f"{d.name} cannot be used here, {d.missing}" for d in chosen if d.missing)
         self._missing.write(missing, "warning")
@@ -148,7 +154,8 @@ class RigChoice:
         change(self._source, visible=_address_option(chosen[0]) is not None)
         self._draw_page()
 
-    def _entered(self) -> Choice:
+    def _read_entered(self) -> Choice:
+        """Return the rig of the entered devices. Raises InputError for an invalid one."""
         camera, projector = self._cameras[self._camera.value], self._projectors[self._projector.value]
         camera_choice: dict[str, Any] = {"driver": camera.name}
         option, address = _address_option(camera), self._source.value.strip()
@@ -166,30 +173,32 @@ class RigChoice:
 
 
 def _label_drivers(drivers: list[Driver]) -> dict[str, Driver]:
+    """Return {label: driver}, the most common driver first."""
     shape_of = sorted(drivers, key=lambda driver: driver.name != _FIRST)
     return {f"{driver.name}: {driver.what}": driver for driver in shape_of}
 
 
 def _address_option(driver: Driver) -> str | None:
-    """The driver's option that chooses one device among several; None where it has none."""
+    """Return the driver's option that chooses one device among several; None where it has none."""
     known = inspect.signature(driver.camera).parameters if driver.camera else {}
     return next((name for name in _ADDRESSES if name in known), None)
 
 
 def _size(text: str) -> list[int]:
+    """Parse "1920x1080" to [width, height] px. Raises InputError."""
     sides = text.lower().replace("×", "x").split("x")
     if len(sides) != 2 or not all(side.strip().isdecimal() for side in sides):
         raise InputError(f"{text!r} is no size: write width x height in px, such as 1920x1080")
     return [int(side) for side in sides]
 
 
-def _same(preset: Choice, choice: Choice) -> bool:
-    """Whether a rig was chosen by this preset; the delay, which is measured later, may differ."""
+def _is_same_rig(preset: Choice, choice: Choice) -> bool:
+    """Whether a rig was chosen by this preset, apart from the delay, which is measured later."""
     return {**preset, "settle_ms": None} == {**choice, "settle_ms": None}
 
 
 def _rig_html(rig: RigView) -> str:
-    """The state of the rig."""
+    """Describe the state of the rig."""
     if rig.state == "none":
         return alert("No rig yet. The simulated rig needs no devices.", "info")
     if rig.state == "lost":
@@ -206,7 +215,7 @@ def _rig_html(rig: RigView) -> str:
 
 
 def _page_html(standing: Any) -> str:
-    """The state of the projector page, and how to open it; without the token, which is not for viewers."""
+    """Describe the state of the projector page, and how to open it; without the token, which viewers must not get."""
     if standing is None:
         return alert("This rig needs the projector page, which is not served here.", "error")
     link = '<a href="/projector" target="_blank" rel="noopener">Open the projector page</a>'

@@ -25,7 +25,7 @@ _FLOOR_MM = 260.0
 
 
 class ViewerScene:
-    """Draws into viser's scene."""
+    """Draws named layers of objects into viser's scene."""
 
     def __init__(self, api: viser.SceneApi) -> None:
         self._api = api
@@ -50,10 +50,10 @@ class ViewerScene:
 
     def show(self, layer: str, visible: bool) -> None:
         """Show or hide a layer and everything in it, now and when it is filled later."""
-        self._layer(layer).visible = visible
+        self._get_layer(layer).visible = visible
 
     def remove(self, layer: str, name: str) -> None:
-        """Remove an object from a layer, if it is there."""
+        """Remove an object from a layer, if it exists."""
         for node in reversed(self._nodes.pop((layer, name), [])):  # what hangs below a node first
             node.remove()
 
@@ -63,7 +63,7 @@ class ViewerScene:
             self.remove(layer, name)
 
     def names(self, layer: str) -> list[str]:
-        """The names of a layer's objects."""
+        """List the names of a layer's objects."""
         return [name for where, name in list(self._nodes) if where == layer]
 
     # objects
@@ -71,13 +71,13 @@ class ViewerScene:
     def device(
         self, layer: str, name: str, K: np.ndarray, size: tuple[int, int], T_camera_device: np.ndarray, colour: Colour
     ) -> None:
-        """A camera or a projector as a frustum; K (3, 3) px, size (width, height) px, T (4, 4) mm."""
+        """Draw a camera or projector as a frustum; K (3, 3) px, size (width, height) px, T (4, 4) mm."""
         width, height = size
-        wxyz, position = _placed(T_camera_device)
+        wxyz, position = _split_pose(T_camera_device)
         handle = self._api.add_camera_frustum(
-            self._path(layer, name),
+            self._make_path(layer, name),
             fov=float(2 * np.arctan2(height / 2, K[1, 1])),
-            # of the angles seen, not of the pixels: a projector's may be far from square
+            # of the viewing angles, not of the pixels: a projector's may be far from square
             aspect=float((width / K[0, 0]) / (height / K[1, 1])),
             scale=_FRUSTUM_MM,
             thickness=2.0,
@@ -86,7 +86,7 @@ class ViewerScene:
             wxyz=wxyz,
             position=position,
         )
-        self._set(layer, name, [handle])
+        self._store_nodes(layer, name, [handle])
 
     def board(
         self,
@@ -101,13 +101,13 @@ class ViewerScene:
         on_click: Callable[[Any], None] | None = None,
         width_px: float = 2.0,
     ) -> None:
-        """A board's outline (4, 3) mm at T_camera_board (4, 4), with a picture (h, w, 3) of it and its name, if given.
+        """Draw a board's outline (4, 3) mm at T_camera_board (4, 4), with its picture (h, w, 3) and name, if given.
 
         The outline's corners go from the board's first feature along its first row and back around, as
         `Board.outline` gives them; the picture's rows run along the board's.
         """
-        path = self._path(layer, name)
-        wxyz, position = _placed(T_camera_board)
+        path = self._make_path(layer, name)
+        wxyz, position = _split_pose(T_camera_board)
         nodes: list[Any] = [self._api.add_frame(path, show_axes=False, wxyz=wxyz, position=position)]
         sides = np.stack([outline, np.roll(outline, -1, axis=0)], axis=1).astype(np.float32)
         nodes.append(
@@ -128,7 +128,7 @@ class ViewerScene:
             nodes.append(
                 self._api.add_label(f"{path}/label", label, position=outline[0], anchor="bottom-left", depth_test=True)
             )
-        self._set(layer, name, nodes)
+        self._store_nodes(layer, name, nodes)
 
     def gizmo(
         self,
@@ -141,11 +141,11 @@ class ViewerScene:
         scale_mm: float = 90.0,
         turns: bool = True,
     ) -> None:
-        """A handle to drag and turn an object; both callbacks get T (4, 4) in the camera's frame."""
-        wxyz, position = _placed(T)
+        """Add a handle to move and turn an object; both callbacks get T (4, 4) in the camera's frame."""
+        wxyz, position = _split_pose(T)
         limits = ((-5000.0, 5000.0),) * 3
         handle = self._api.add_transform_controls(
-            self._path(layer, name),
+            self._make_path(layer, name),
             scale=scale_mm,
             wxyz=wxyz,
             position=position,
@@ -156,17 +156,18 @@ class ViewerScene:
 
         @handle.on_update
         def _(event: Any) -> None:
-            on_move(_matrix(event.target))
+            """Call the callbacks with the handle's new pose."""
+            on_move(_read_pose(event.target))
             if on_end is not None and event.phase == "end":
-                on_end(_matrix(event.target))
+                on_end(_read_pose(event.target))
 
-        self._set(layer, name, [handle])
+        self._store_nodes(layer, name, [handle])
 
     def move(self, layer: str, name: str, T: np.ndarray) -> None:
         """Move an existing object to T (4, 4), without calling its callbacks."""
         nodes = self._nodes.get((layer, name))
         if nodes:
-            nodes[0].wxyz, nodes[0].position = _placed(T)
+            nodes[0].wxyz, nodes[0].position = _split_pose(T)
 
     def cloud(
         self,
@@ -176,16 +177,17 @@ class ViewerScene:
         colours: np.ndarray | Colour,
         limit: int = SHOWN_POINTS,
     ) -> int:
-        """A cloud (h, w, 3) or (n, 3) float32 mm with grey levels of its shape, colours (..., 3) uint8, or one colour;
-        NaN points are skipped. Returns the number of points shown: evenly thinned to about `limit`, an organised
-        cloud by rows and columns, so that no stripes appear.
+        """Draw a cloud (h, w, 3) or (n, 3) float32 mm; returns the number of points shown.
+
+        Colours are grey levels of its shape, (..., 3) uint8, or one colour. NaN points are skipped. It is evenly
+        thinned to about `limit` points, an organised cloud by rows and columns, so that no stripes appear.
         """
         shown, colours = thin(points, colours, limit)
         if not len(shown):
             self.remove(layer, name)
             return 0
         handle = self._api.add_point_cloud(
-            self._path(layer, name),
+            self._make_path(layer, name),
             shown,
             colours,
             point_size=spacing(shown),
@@ -193,7 +195,7 @@ class ViewerScene:
             point_shading="flat",
             precision="float32",
         )
-        self._set(layer, name, [handle])
+        self._store_nodes(layer, name, [handle])
         return len(shown)
 
     def mark(
@@ -205,15 +207,15 @@ class ViewerScene:
         colour: Colour = (220, 40, 40),
         radius_mm: float = 1.5,
     ) -> None:
-        """A point (3,) mm with a label."""
-        path = self._path(layer, name)
+        """Draw a point (3,) mm as a ball with a label."""
+        path = self._make_path(layer, name)
         ball = self._api.add_icosphere(path, radius=radius_mm, color=colour, position=np.asarray(point, float))
-        self._set(layer, name, [ball, self._api.add_label(f"{path}/words", text, anchor="bottom-left")])
+        self._store_nodes(layer, name, [ball, self._api.add_label(f"{path}/words", text, anchor="bottom-left")])
 
     def ball(self, layer: str, name: str, centre: np.ndarray, radius_mm: float, colour: Colour) -> None:
-        """A transparent ball around centre (3,) mm."""
+        """Draw a transparent ball around centre (3,) mm."""
         handle = self._api.add_icosphere(
-            self._path(layer, name),
+            self._make_path(layer, name),
             radius=radius_mm,
             color=colour,
             opacity=0.3,
@@ -221,13 +223,13 @@ class ViewerScene:
             cast_shadow=False,
             receive_shadow=False,
         )
-        self._set(layer, name, [handle])
+        self._store_nodes(layer, name, [handle])
 
     def drawing(
         self, layer: str, name: str, segments: np.ndarray, colour: Colour, place: np.ndarray, text: str
     ) -> None:
-        """Segments (n, 2, 3) mm (n may be 0), and a label at place (3,) mm."""
-        path = self._path(layer, name)
+        """Draw segments (n, 2, 3) mm (n may be 0), and a label at place (3,) mm."""
+        path = self._make_path(layer, name)
         nodes: list[Any] = [self._api.add_frame(path, show_axes=False)]
         if len(segments):
             nodes.append(
@@ -238,40 +240,45 @@ class ViewerScene:
         nodes.append(
             self._api.add_label(f"{path}/words", text, position=np.asarray(place, float), anchor="bottom-left")
         )
-        self._set(layer, name, nodes)
+        self._store_nodes(layer, name, nodes)
 
     def on_pick(self, do: Callable[[np.ndarray, np.ndarray], None] | None) -> None:
-        """Call `do(origin, direction)`, (3,) each in the camera's frame, for each click into the scene; None: end."""
+        """Call `do(origin, direction)`, (3,) each in the camera's frame, for each click into the scene; None: stop."""
         if self._pick is not None:
             self._api.remove_click_callback(self._pick)
             self._pick = None
         if do is not None:
 
             def pick(event: Any) -> None:
+                """Call `do` with the ray of a click."""
                 do(np.array(event.ray_origin), np.array(event.ray_direction))
 
             self._pick = self._api.on_click()(pick)
 
-    def _layer(self, layer: str) -> Any:
+    def _get_layer(self, layer: str) -> Any:
+        """Return the node of a layer, created where it is missing."""
         if layer not in self._layers:
             self._layers[layer] = self._api.add_frame(f"/{layer}", show_axes=False)
         return self._layers[layer]
 
-    def _path(self, layer: str, name: str) -> str:
-        self._layer(layer)
+    def _make_path(self, layer: str, name: str) -> str:
+        """Return the path of an object's node in its layer, with slashes in its name replaced."""
+        self._get_layer(layer)
         # names are entered by the operator: a slash would make another layer
         return f"/{layer}/{name.replace('/', '_')}"
 
-    def _set(self, layer: str, name: str, nodes: list[Any]) -> None:
+    def _store_nodes(self, layer: str, name: str, nodes: list[Any]) -> None:
+        """Store the nodes of an object, its root first."""
         self._nodes[layer, name] = nodes
 
 
-def _placed(T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(wxyz, position) of T (4, 4)."""
+def _split_pose(T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return (wxyz, position) of T (4, 4)."""
     return tf.SO3.from_matrix(T[:3, :3]).wxyz, T[:3, 3]
 
 
-def _matrix(handle: Any) -> np.ndarray:
+def _read_pose(handle: Any) -> np.ndarray:
+    """Return T (4, 4) of a handle's position and orientation."""
     T = np.eye(4)
     T[:3, :3] = tf.SO3(np.asarray(handle.wxyz, float)).as_matrix()
     T[:3, 3] = handle.position
@@ -281,8 +288,10 @@ def _matrix(handle: Any) -> np.ndarray:
 def thin(
     points: NDArray[np.float32], colours: NDArray[np.uint8] | Colour, limit: int
 ) -> tuple[NDArray[np.float32], Any]:
-    """(points (n, 3), their colours (n, 3) or the one colour): every so many rows and columns of an organised cloud
-    (h, w, 3), or points of (n, 3), at most about `limit`; NaN points are skipped, grey levels become colours.
+    """Thin a cloud to about `limit` points: (points (n, 3), their colours (n, 3) or the one colour).
+
+    An organised cloud (h, w, 3) is thinned by rows and columns, (n, 3) by points; NaN points are skipped, grey levels
+    become colours.
     """
     valid = np.asarray(np.isfinite(points).all(axis=-1))
     excess = np.count_nonzero(valid) / limit
@@ -299,7 +308,7 @@ def thin(
 
 
 def spacing(points: np.ndarray) -> float:
-    """Approximate distance, mm, between neighbours of an evenly sampled surface."""
+    """Estimate the distance, mm, between neighbours of an evenly sampled surface."""
     low, high = np.percentile(points, [1, 99], axis=0)
     sides = np.sort(high - low)
     return float(np.clip(1.3 * np.sqrt(max(sides[1] * sides[2], 1e-6) / len(points)), 0.05, 20.0))

@@ -42,14 +42,14 @@ DEVICES = "devices"
 
 
 class DeviceLayer:
-    """Keeps the frusta of camera and projector up to date."""
+    """Draws the frusta of camera and projector."""
 
     def __init__(self, scene: ViewerScene) -> None:
         self._scene = scene
         self._drawn: tuple[CalibrationView | None, tuple[int, int] | None] = (None, None)
 
     def draw(self, snapshot: Snapshot) -> None:
-        """Show the devices of this snapshot."""
+        """Draw the devices of a snapshot, if they have changed."""
         calibration = snapshot.calibration
         camera, projector = snapshot.rig.camera, snapshot.rig.projector
         if (calibration, camera) == self._drawn:
@@ -67,7 +67,7 @@ class DeviceLayer:
 
 
 class Shell:
-    """Builds the page once; `draw` and `draw_preview` bring it up to date, from one thread."""
+    """The page: builds it once; `draw` and `draw_preview` update it, from one thread."""
 
     def __init__(self, context: PanelContext, steps: Sequence[StepView]) -> None:
         self._gui, self._context = context.gui, context
@@ -83,13 +83,14 @@ class Shell:
         self._build_right()
 
     def go(self, key: str) -> None:
-        """Show another step with the next drawing; for any thread."""
+        """Show another step at the next drawing; may be called from any thread."""
         if key in self._panels:
             self.current = key
 
     # building
 
     def _build_left(self, steps: Sequence[StepView]) -> None:
+        """Build the left panel: buttons of the steps, autopilot, session and messages."""
         gui, context = self._gui, self._context
         gui.main_panel.dock_left()
         gui.main_panel.set_width(STEPS_PX)
@@ -113,6 +114,7 @@ class Shell:
             self._latest = Text(gui)
 
     def _build_right(self) -> None:
+        """Build the right panel: heading, problems, progress, and the panels of all steps."""
         gui, context = self._gui, self._context
         panel = gui.add_panel()
         panel.dock_right()
@@ -125,7 +127,9 @@ class Shell:
             self._cancel = context.button(
                 "Cancel", context.operator.cancel, viser.Icon.PLAYER_STOP, "red", visible=False, at_once=True
             )
-            self._next = context.button("Continue", self._continue, viser.Icon.ARROW_RIGHT, "green", visible=False)
+            self._next = context.button(
+                "Continue", self._show_next_step, viser.Icon.ARROW_RIGHT, "green", visible=False
+            )
             self._folders: dict[str, viser.GuiFolderHandle] = {}
             for key, step_panel in self._panels.items():
                 self._folders[key] = folder = gui.add_folder(None, visible=False)
@@ -135,7 +139,7 @@ class Shell:
     # drawing
 
     def draw(self, snapshot: Snapshot) -> None:
-        """Show this snapshot."""
+        """Update the page from a snapshot."""
         self._follow_autopilot(snapshot)
         key = self.current
         if key != self._shown_key:
@@ -150,7 +154,7 @@ class Shell:
         self._panels[key].draw(snapshot)
 
     def draw_preview(self, preview: PreviewView) -> None:
-        """Show this frame, if the step shows one."""
+        """Show a preview, if the current step shows one."""
         if self._shown_key:
             self._panels[self._shown_key].draw_preview(preview)
 
@@ -160,7 +164,7 @@ class Shell:
         return self.current != self._shown_key
 
     def _follow_autopilot(self, snapshot: Snapshot) -> None:
-        """Show the step of the autopilot, when it comes to another one."""
+        """Show the autopilot's step when it advances to another one."""
         key, keys = autopilot_step(snapshot), ["", *self._panels]
         onward = keys.index(key) > keys.index(self._autopilot_key)  # between two of its acts it may seem to step back
         if key != self._autopilot_key and (onward or not key):
@@ -168,6 +172,7 @@ class Shell:
             self.go(key)
 
     def _switch_panel(self, key: str) -> None:
+        """Hide the shown step and show another one."""
         if self._shown_key:
             self._folders[self._shown_key].visible = False
             self._panels[self._shown_key].show(False)
@@ -178,6 +183,7 @@ class Shell:
         self._folders[key].visible = True
 
     def _draw_heading(self, snapshot: Snapshot) -> None:
+        """Show the step's title, state, instruction and problems, and the button to continue."""
         steps = list(snapshot.steps)
         at = next(i for i, step in enumerate(steps) if step.key == self._shown_key)
         step = steps[at]
@@ -194,6 +200,7 @@ class Shell:
         change(self._next, visible=ready)
 
     def _draw_progress(self, snapshot: Snapshot) -> None:
+        """Show the progress of capture and job, and whether it can be cancelled."""
         work = _running_work(snapshot)
         bars = "".join(
             f'<div style="margin-bottom:0.3em">{to_html(text)}{meter(share, "info")}</div>' for text, share in work
@@ -209,6 +216,7 @@ class Shell:
             self._busy.write(f"{job.stage or job.name} …" if job is not None else "Idle", "dim")
 
     def _draw_session(self, snapshot: Snapshot) -> None:
+        """Show the session's folder, contents and free space, the autopilot and the latest notices."""
         session, space = snapshot.session, snapshot.space
         if session is None:
             self._session.set(alert("No session is open: enter a folder.", "warning"))
@@ -216,7 +224,7 @@ class Shell:
             lines = [
                 f"<b>{to_html(session.folder.name)}</b>",
                 f'<span style="overflow-wrap:anywhere">{coloured(session.folder, "dim")}</span>',
-                f"{_count(len(session.poses), 'pose')}, {_count(len(session.scans), 'scan')}",
+                f"{_format_count(len(session.poses), 'pose')}, {_format_count(len(session.scans), 'scan')}",
             ]
             if space is not None:
                 needs = f"; a capture needs {format_bytes(space.capture_bytes)}" if space.capture_bytes else ""
@@ -231,18 +239,20 @@ class Shell:
             color="red" if snapshot.autopilot else "teal",
         )
         self._autopilot_status.set(alert(snapshot.autopilot, "info") if snapshot.autopilot else "")
-        latest = "".join(_notice(notice) for notice in reversed(snapshot.notices[-_MOST_NOTICES:]))
+        latest = "".join(_notice_html(notice) for notice in reversed(snapshot.notices[-_MOST_NOTICES:]))
         # as high as a small screen leaves, so that the panel itself does not scroll
         style = "max-height:max(6em, calc(100vh - 625px));overflow-y:auto;overflow-wrap:anywhere"
         self._latest.set(f'<div style="{style}">{latest or paragraph(coloured("No messages.", "dim"))}</div>')
 
     # requests
 
-    def _continue(self) -> None:
+    def _show_next_step(self) -> None:
+        """Show the next step."""
         keys = list(self._panels)
         self.go(keys[min(keys.index(self._shown_key) + 1, len(keys) - 1)])
 
     def _toggle_autopilot(self) -> None:
+        """Start the autopilot, or stop it where it runs."""
         operator = self._context.operator
         if operator.snapshot().autopilot:
             operator.cancel()
@@ -251,7 +261,7 @@ class Shell:
 
 
 def autopilot_step(snapshot: Snapshot) -> str:
-    """The key of the autopilot's step, from what it has done so far; empty while it is off."""
+    """Return the key of the autopilot's step, from what it has done so far; empty while it is off."""
     session, world = snapshot.session, snapshot.world
     if not snapshot.autopilot or session is None or world is None:
         return ""
@@ -279,13 +289,13 @@ def notify(client: viser.ClientHandle, level: Level, text: str) -> None:
 
 
 def greet_viewer(client: viser.ClientHandle) -> None:
-    """Show a browser that it may only watch."""
+    """Show a view-only browser that it cannot change anything."""
     with client.atomic():
         client.gui.add_html(str(alert("View only: this link changes nothing.", "info")), order=-1.0)
 
 
 def format_bytes(n: int) -> str:
-    """A size with its unit: "3.4 MB"."""
+    """Format a size with its unit: "3.4 MB"."""
     size = float(n)
     for unit in ("bytes", "kB", "MB", "GB"):
         if size < 1000:
@@ -295,7 +305,7 @@ def format_bytes(n: int) -> str:
 
 
 def _running_work(snapshot: Snapshot) -> list[tuple[str, float]]:
-    """(description, share done) of the capture and the job that the operator requested."""
+    """List (description, share done) of the running capture and of the requested job."""
     job, capture, work = snapshot.job, snapshot.rig.capture, []
     if capture is not None:
         waiting = f", {capture.waiting} waiting" if capture.waiting else ""
@@ -309,10 +319,12 @@ def _running_work(snapshot: Snapshot) -> list[tuple[str, float]]:
     return work
 
 
-def _count(n: int, noun: str) -> str:
+def _format_count(n: int, noun: str) -> str:
+    """Return a count and its noun, in the plural unless `n` is 1."""
     return f"{n} {noun}{'' if n == 1 else 's'}"
 
 
-def _notice(notice: Notice) -> str:
+def _notice_html(notice: Notice) -> str:
+    """Return the HTML of a notice: its time, and the text in its tone."""
     time = coloured(f"{notice.time:%H:%M}", "dim")
     return paragraph(Html(f"{time} {coloured(notice.text, _NOTICES[notice.level][3])}"))

@@ -16,7 +16,7 @@ _GIZMO = "simulated object"
 
 
 class SimulatedObject:
-    """A folder of inputs that offers `things`; hidden with real devices."""
+    """Inputs that place and move an object in front of the simulated rig; hidden with real devices."""
 
     def __init__(self, context: PanelContext, layer: str, things: Sequence[str]) -> None:
         self._context, self._layer, self._things = context, layer, tuple(things)
@@ -31,13 +31,13 @@ class SimulatedObject:
             self._turn = gui.add_number("Turn, °", 0.0, min=-90.0, max=90.0, step=5.0)
             self._handles = gui.add_checkbox("3D handles", False, hint="To move and turn it in the 3D view")
         self._values = [SessionValue(each) for each in (self._thing, self._distance, self._turn)]
-        self._thing.on_update(context.callback(self._choose, by_user=True))
+        self._thing.on_update(context.callback(self._request_choice, by_user=True))
         self._handles.on_update(context.callback(self._draw_handles))
-        self._distance.on_update(self._on_number(self._distance, "distance_mm"))
-        self._turn.on_update(self._on_number(self._turn, "turn_deg"))
+        self._distance.on_update(self._make_number_callback(self._distance, "distance_mm"))
+        self._turn.on_update(self._make_number_callback(self._turn, "turn_deg"))
 
     def draw(self, snapshot: Snapshot) -> None:
-        """Show the object that is there now."""
+        """Show the object in view, its depth and turn."""
         world = snapshot.world
         change(self._folder, visible=world is not None)
         if world is None:
@@ -59,26 +59,30 @@ class SimulatedObject:
             shown.update(value)
 
     def _draw_handles(self) -> None:
+        """Add, move or remove the 3D handles of the object in view."""
         scene, wanted = self._context.scene, self._standing if self._handles.value else ""
         if not wanted:
             scene.remove(self._layer, _GIZMO)
         elif wanted != self._handled:
-            scene.gizmo(self._layer, _GIZMO, self._T, lambda T: None, self._place)
+            scene.gizmo(self._layer, _GIZMO, self._T, lambda T: None, self._request_place)
         else:
             scene.move(self._layer, _GIZMO, self._T)
         self._handled = wanted
 
-    def _place(self, T: np.ndarray) -> None:
+    def _request_place(self, T: np.ndarray) -> None:
+        """Request that the object be moved to T (4, 4) mm."""
         self._context.callback(lambda: self._context.operator.place(self._standing, T))(None)  # type: ignore[arg-type]
 
-    def _choose(self) -> None:
+    def _request_choice(self) -> None:
+        """Request that the chosen object be placed in view."""
         if self._thing.value in self._things:
             self._context.operator.place(self._thing.value)
 
-    def _on_number(self, number: Any, what: str) -> Callable[[Any], None]:
-        """Moves the object where a user enters a number, but not to its first digits alone."""
+    def _make_number_callback(self, number: Any, what: str) -> Callable[[Any], None]:
+        """Return a callback that moves the object by a number entered in a browser, if it is within its limits."""
 
         def changed(event: Any) -> None:
+            """Move the object, if a browser has set a valid number."""
             if event.client_id is not None and number.min <= number.value <= number.max:
                 value = number.value  # read now: an older snapshot may be drawn over it before the callback's turn
                 self._context.callback(lambda: self._context.operator.move_object(**{what: value}))(event)

@@ -15,21 +15,21 @@ FIELD_OF_VIEW = 0.75  # rad
 
 
 class Viewpoints:
-    """The viewpoints of all browsers; `clients()` gives those that are connected."""
+    """Moves the views of all browsers; `clients()` returns those that are connected."""
 
     def __init__(self, clients: Callable[[], Iterable[viser.ClientHandle]]) -> None:
         self._clients = clients
         self._shown = ""
 
     def overview(self) -> None:
-        """Show the whole rig again, after a cloud was shown."""
+        """Show the whole rig again, if a cloud was shown."""
         if self._shown:
             self._shown = ""
             for client in self._clients():
-                _look(client, *(np.array(each) for each in OVERVIEW))
+                _set_view(client, *(np.array(each) for each in OVERVIEW))
 
     def show(self, name: str, points: np.ndarray | None) -> None:
-        """Show the points (..., 3) mm, unless those of the same `name` are shown already."""
+        """Move all views to the points (..., 3) mm, unless those of the same `name` are shown already."""
         if points is None or name == self._shown:
             return
         self._shown = name
@@ -46,10 +46,11 @@ def look_at_points(client: viser.ClientHandle, points: np.ndarray) -> None:
     low, high = np.percentile(flat, [2, 98], axis=0)
     middle, size = (low + high) / 2, float(np.linalg.norm(high - low))
     away = max(1.45 * size * max(1.0, 0.85 / client.camera.aspect), 50.0)  # the field of view is that of the height
-    _look(client, middle + _FROM * away, middle)
+    _set_view(client, middle + _FROM * away, middle)
 
 
-def _look(client: viser.ClientHandle, position: np.ndarray, at: np.ndarray) -> None:
+def _set_view(client: viser.ClientHandle, position: np.ndarray, at: np.ndarray) -> None:
+    """Set one browser's camera position and target (3,) mm."""
     with client.atomic():
         client.camera.position = tuple(position)  # this also moves the target
         client.camera.look_at = tuple(at)

@@ -47,38 +47,40 @@ _BOXES = {
 
 
 class Html(str):
-    """Text that is HTML already, made by code from escaped parts; adding to it gives HTML."""
+    """HTML made from escaped parts; adding text to it gives HTML."""
 
     def __add__(self, other: str) -> "Html":
+        """Return the concatenation as HTML."""
         return Html(str(self) + other)
 
 
 def to_html(text: object) -> Html:
-    """Any text as HTML that shows exactly it, without a line break between a figure and its unit."""
+    """Escape any text as HTML, without line breaks between a figure and its unit; HTML stays as it is."""
     return text if isinstance(text, Html) else Html(_UNIT.sub("&#160;", escape(str(text))))
 
 
 def coloured(text: object, tone: Tone, *, bold: bool = False) -> Html:
-    """Text in a tone's colour."""
+    """Return text in a tone's colour."""
     weight = ";font-weight:600" if bold else ""
     return Html(f'<span style="color:{_TONES[tone]}{weight}">{to_html(text)}</span>')
 
 
 def paragraph(content: object) -> Html:
-    """HTML with the margins of viser's inputs."""
+    """Return HTML with the margins of viser's inputs."""
     return Html(f'<div style="padding:0 0.75em 0.5em;font-size:0.875em;line-height:1.45">{to_html(content)}</div>')
 
 
 def alert(content: object, tone: Tone) -> Html:
-    """A box in a tone's colour, for a message that must not be overlooked."""
+    """Return a box in a tone's colour, for a message that must not be overlooked."""
     style = f"background:{_BOXES[tone]};border-left:3px solid {_TONES[tone]};border-radius:4px;padding:0.5em 0.7em"
     return paragraph(Html(f'<div style="{style}">{to_html(content)}</div>'))
 
 
 def table(titles: Sequence[object], rows: Sequence[Sequence[object]]) -> Html:
-    """Rows below their titles: the first column left-aligned, the others right-aligned and without line breaks."""
+    """Return a table: the first column left-aligned, the others right-aligned and without line breaks."""
 
     def line(tag: str, cells: Sequence[object], style: str) -> str:
+        """Return one row of cells with this HTML tag and style."""
         sides = ["left"] + [f"right{';white-space:nowrap' * (tag == 'td')}"] * (len(cells) - 1)
         return "".join(
             f'<{tag} style="text-align:{side};padding:0.2em 0 0.2em 0.6em;{style}">{to_html(c)}</{tag}>'
@@ -95,9 +97,10 @@ def table(titles: Sequence[object], rows: Sequence[Sequence[object]]) -> Html:
 
 
 def report_table(shown: Table) -> Html:
-    """A table of the report, with its notes."""
+    """Return a table of the report, with its notes."""
 
     def cell(value: str | Cell) -> Html:
+        """Return the text of a cell, coloured by its mark."""
         mark = value.mark if isinstance(value, Cell) else ""
         text = value.text if isinstance(value, Cell) else value
         tones: dict[Mark, Tone] = {"better": "good", "worse": "warning", "muted": "dim"}
@@ -109,7 +112,7 @@ def report_table(shown: Table) -> Html:
 
 
 def link(address: str, text: str) -> Html:
-    """A link that downloads the file at this address of the server."""
+    """Return a button-like link that downloads the file at this address of the server."""
     style = (
         "display:inline-block;padding:0.35em 0.9em;border-radius:4px;text-decoration:none;font-weight:600;"
         "background:var(--mantine-primary-color-filled);color:#fff"
@@ -118,7 +121,7 @@ def link(address: str, text: str) -> Html:
 
 
 def thumbnail(jpeg: bytes, width_px: int = 72, alt: str = "") -> Html:
-    """A small picture inside HTML; an empty box until there is one."""
+    """Return a small picture inside HTML; an empty box where there is no JPEG yet."""
     height = round(0.75 * width_px)
     if not jpeg:
         style = f"width:{width_px}px;height:{height}px;border-radius:4px;background:var(--mantine-color-gray-light)"
@@ -129,7 +132,7 @@ def thumbnail(jpeg: bytes, width_px: int = 72, alt: str = "") -> Html:
 
 
 def meter(share: float, tone: Tone = "good") -> Html:
-    """A bar that is filled to `share`, 0 ... 1."""
+    """Return a bar that is filled to `share`, 0 ... 1."""
     width = 100 * min(max(share, 0.0), 1.0)
     return Html(
         '<div style="height:6px;border-radius:3px;background:var(--mantine-color-gray-light)">'
@@ -138,14 +141,14 @@ def meter(share: float, tone: Tone = "good") -> Html:
 
 
 class Text:
-    """One piece of HTML in a panel, sent only when it changes, hidden while it is empty."""
+    """A piece of HTML in a panel, sent only when it changes, hidden while it is empty."""
 
     def __init__(self, gui: viser.GuiApi) -> None:
         self._handle = gui.add_html("", visible=False)
         self._content = ""
 
     def set(self, content: str) -> None:
-        """Show this HTML, as `paragraph`, `alert`, `table` and the like give it."""
+        """Show HTML, as `paragraph`, `alert`, `table` and the like return it."""
         if content != self._content:
             self._content = content
             self._handle.content = str(content)  # an Html would not be sent
@@ -153,7 +156,7 @@ class Text:
                 self._handle.visible = bool(content)
 
     def write(self, text: str, tone: Tone = "plain") -> None:
-        """Show a sentence, in a box where its tone requires attention; nothing where it is empty."""
+        """Show a sentence, in a box where its tone requires attention; hide it where it is empty."""
         if not text:
             self.set("")
         elif tone in ("plain", "dim"):
@@ -163,7 +166,7 @@ class Text:
 
 
 class Picture:
-    """An image in a panel with a line of legend below, sent only when it changes."""
+    """An image in a panel with a legend below, hidden until there is one."""
 
     def __init__(self, gui: viser.GuiApi, label: str | None = None, *, width_px: int = PICTURE_PX) -> None:
         self._width = width_px
@@ -172,21 +175,21 @@ class Picture:
         self._legend = Text(gui)
 
     def set(self, image: np.ndarray, legend: str = "") -> None:
-        """Show (h, w) or (h, w, 3) uint8 RGB, scaled to the panel, and the legend (HTML, empty: none)."""
+        """Show an image (h, w) or (h, w, 3) uint8 RGB, scaled to the panel, and the legend (HTML, empty: none)."""
         self._image.image = fitted(image, self._width)
         if not self._image.visible:
             self._image.visible = True
         self._legend.set(legend)
 
     def hide(self) -> None:
-        """Show nothing."""
+        """Hide image and legend."""
         if self._image.visible:
             self._image.visible = False
         self._legend.set("")
 
 
 class Sound:
-    """Short tones in the browsers that show the page; a browser stays silent until someone has clicked in it."""
+    """Plays short tones in the browsers that show the page; silent until someone has clicked in them."""
 
     _TONES_HZ: ClassVar[dict[str, tuple[float, ...]]] = {
         "tick": (880.0,),
@@ -200,13 +203,14 @@ class Sound:
         self._count = 0
 
     def play(self, name: Literal["tick", "captured", "good", "bad"]) -> None:
-        """Play it once."""
+        """Play a tone once in every browser."""
         self._count += 1
-        data = base64.b64encode(_wav(self._TONES_HZ[name])).decode()
+        data = base64.b64encode(_encode_wav(self._TONES_HZ[name])).decode()
         self._handle.content = f'<audio autoplay data-n="{self._count}" src="data:audio/wav;base64,{data}"></audio>'
 
 
-def _wav(tones_hz: Sequence[float], rate: int = 8000, seconds: float = 0.12) -> bytes:
+def _encode_wav(tones_hz: Sequence[float], rate: int = 8000, seconds: float = 0.12) -> bytes:
+    """Return a WAV file, 8-bit mono, of tones in Hz that each last `seconds`."""
     t = np.arange(int(rate * seconds)) / rate
     envelope = np.minimum(1, np.minimum(t, seconds - t) / 0.01)  # without it, tones click
     samples = np.concatenate([envelope * np.sin(2 * np.pi * f * t) for f in tones_hz])
@@ -220,7 +224,7 @@ def _wav(tones_hz: Sequence[float], rate: int = 8000, seconds: float = 0.12) -> 
 
 
 def fitted(image: np.ndarray, width_px: int = PICTURE_PX) -> np.ndarray:
-    """(h, w) or (h, w, 3) uint8 as (h', width_px, 3) RGB, for `add_image`."""
+    """Resize an image (h, w) or (h, w, 3) uint8 to (h', width_px, 3) RGB, for `add_image`."""
     if image.ndim == 2:
         image = cv2.cvtColor(image, cv2.COLOR_GRAY2RGB)
     height, width = image.shape[:2]
@@ -234,7 +238,7 @@ _COLOUR_MAPS = {"value": "viridis", "error": "RdBu_r"}  # an error's: blue below
 def colours(
     values: NDArray[np.floating], low: float, high: float, scale: Literal["value", "error"] = "value"
 ) -> NDArray[np.uint8]:
-    """(…, 3) uint8 RGB for values (…), spread over low ... high; middle grey where NaN."""
+    """Map values (...) to colours (..., 3) uint8 RGB over low ... high; middle grey where NaN."""
     from matplotlib import colormaps
 
     share = (np.asarray(values, float) - low) / max(high - low, 1e-12)
@@ -245,7 +249,7 @@ def colours(
 def colour_bar(
     low: str, high: str, scale: Literal["value", "error"] | NDArray[np.uint8] = "value", title: str = ""
 ) -> Html:
-    """The legend of a colour scale, that of `colours` or colours (n, 3), from `low` to `high`, both with units."""
+    """Return the legend of a colour scale, that of `colours` or colours (n, 3), from `low` to `high` with units."""
     palette = colours(np.linspace(0, 1, 9), 0, 1, scale) if isinstance(scale, str) else scale
     stops = ",".join("rgb({},{},{})".format(*colour) for colour in palette)
     return paragraph(
@@ -259,14 +263,14 @@ def colour_bar(
 
 
 def paint(values: NDArray[np.floating], unit: str, digits: int, title: str) -> tuple[NDArray[np.uint8], Html]:
-    """(colours (…, 3) of values (…), their legend), from the 1st to the 99th percentile; middle grey where NaN."""
+    """Return (colours (..., 3) of values (...), their legend), from the 1st to the 99th percentile; grey where NaN."""
     low, high = colour_range(values)
     bar = colour_bar(f"{low:.{digits}f} {unit}", f"{high:.{digits}f} {unit}", "value", title)
     return colours(values, low, high), bar
 
 
 def colour_range(values: NDArray[np.floating]) -> tuple[float, float]:
-    """The limits of a colour scale: the 1st and 99th percentile of the finite values; (0, 1) where there is none."""
+    """Return the limits of a colour scale: 1st and 99th percentile of the finite values; (0, 1) without any."""
     finite = values[np.isfinite(values)]
     if not finite.size:
         return 0.0, 1.0

@@ -36,7 +36,7 @@ _MOST_NAMED = 6  # poses of a verdict that are offered as buttons: they fit on t
 
 
 class Panel(StepPanel):
-    """The calibration."""
+    """Panel of the step Calibrate."""
 
     key = "calibrate"
     layers = (LAYER, BOARDS)
@@ -50,6 +50,7 @@ class Panel(StepPanel):
         self._chosen = ""  # the operator's model in the latest snapshot
 
     def build(self) -> None:
+        """Create the inputs, plots and tables."""
         gui, context, operator = self._gui, self._context, self._operator
         self._calibrate = context.button("Calibrate", operator.calibrate, viser.Icon.TARGET, None)
         self._verdict = Text(gui)
@@ -97,6 +98,7 @@ class Panel(StepPanel):
         self._over.on_change(context.callback(self._request_cloud))
 
     def draw(self, snapshot: Snapshot) -> None:
+        """Show the calibration of a snapshot, and request its pictures."""
         with self._lock:
             self._snapshot = snapshot
             session, calibration, busy = snapshot.session, snapshot.calibration, snapshot.is_busy
@@ -130,6 +132,7 @@ class Panel(StepPanel):
             self._refresh()
 
     def _draw_verdict(self, session: SessionView | None, calibration: CalibrationView | None) -> None:
+        """Show the verdict, the poses that it names and the exclusions."""
         verdict = session.verdict if session else None
         if session is not None and verdict is not None:
             self._verdict.set(verdict_html(verdict, session.verdict_of_calibration, calibration))
@@ -147,6 +150,7 @@ class Panel(StepPanel):
         self._exclusions.set(exclusions_html(calibration) if calibration else "")
 
     def _draw_models(self, calibration: CalibrationView | None, busy: bool) -> None:
+        """Show the choice and the comparison of the models, where there are several."""
         several = calibration is not None and len(calibration.models) > 1 and bool(calibration.stereo.poses)
         change(self._models_folder, visible=several)
         if calibration is None or not several:
@@ -167,13 +171,14 @@ class Panel(StepPanel):
             self._splined.write(f"No splined model: {calibration.missing}." if calibration.missing else "", "dim")
 
     def show(self, visible: bool) -> None:
+        """Show or hide the layers, and react to clicks into the scene while shown."""
         super().show(visible)
-        self._scene.on_pick(self._pick if visible else None)
+        self._scene.on_pick(self._pick_pixel if visible else None)
 
     # pictures
 
     def _refresh(self) -> None:
-        """Request the pictures of what is chosen."""
+        """Request the pictures of the chosen pose, axis and pixel."""
         with self._lock:
             session = self._snapshot.session if self._snapshot else None
             if session is None or session.calibration is None:
@@ -191,7 +196,9 @@ class Panel(StepPanel):
                 )
             self._draw_pose(session, calibration)
             self._draw_boards(session, calibration)
-            self._painter.request("parameters", made, lambda: _parameters(self._detailed(made)), self._parameters.set)
+            self._painter.request(
+                "parameters", made, lambda: _parameters(self._load_details(made)), self._parameters.set
+            )
             axis = cast(Axis, self._axis.value)
             if axis not in calibration.fit_rms_mm:
                 return
@@ -210,6 +217,7 @@ class Panel(StepPanel):
             )
 
     def _draw_pose(self, session: SessionView, calibration: CalibrationView) -> None:
+        """Show the reprojection error of the chosen pose, and request its residuals as arrows."""
         name, device = self._pose.value, self._device.value
         pose = next((pose for pose in session.poses if pose.name == name), None)
         if pose is None:
@@ -235,7 +243,8 @@ class Panel(StepPanel):
         made = fingerprint(calibration)
 
         def arrows() -> Figure | None:
-            details = self._detailed(made)
+            """Plot the residuals of the pose as arrows in the chosen device; None where there are none."""
+            details = self._load_details(made)
             residuals, title = details.residuals.get(name), f"{name}, {device}"
             if residuals is None:
                 return None
@@ -248,7 +257,7 @@ class Panel(StepPanel):
         self._painter.request("arrows", (made, name, device), arrows, self._arrows.set)
 
     def _draw_boards(self, session: SessionView, calibration: CalibrationView) -> None:
-        """The poses in 3D, coloured from green to red by their reprojection error, the chosen one thick."""
+        """Draw the poses in 3D, coloured from green to red by reprojection error, the chosen one thick."""
         scene, chosen = self._scene, self._pose.value
         key = (
             fingerprint(calibration),
@@ -274,13 +283,14 @@ class Panel(StepPanel):
                 scene.board(BOARDS, pose.name, pose.T_camera_board, outline, colour, label=label, width_px=width)
         scene.show(BOARDS, self._visible)
 
-    def _detailed(self, made: tuple[Any, ...]) -> CalibrationFigures:
-        """The calibration with its residuals, read once; on the painter's thread."""
+    def _load_details(self, made: tuple[Any, ...]) -> CalibrationFigures:
+        """Return the calibration with its residuals, read once, on the painter's thread."""
         if self._details is None or self._details[0] != made:
             self._details = made, calibration_view(self._context.session)
         return self._details[1]
 
     def _draw_curve(self, made: tuple[tuple[int, int], PixelCurve | None]) -> None:
+        """Show data and fit of a pixel, or that it has too few poses."""
         (u, v), curve = made
         if curve is None:
             self._curve_note.write(f"Pixel ({u}, {v}) saw the board in too few poses: choose another.", "warning")
@@ -292,20 +302,24 @@ class Panel(StepPanel):
     # requests
 
     def _toggle_anyway(self) -> None:
+        """Request that the rejected calibration be used, or no longer."""
         calibration = self._snapshot.calibration if self._snapshot else None
         if calibration is not None and calibration.rejected and self._anyway.value != calibration.is_pinned:
             self._operator.accept_rejected_calibration(self._anyway.value)
 
     def _choose_model(self) -> None:
+        """Request the chosen model, if it is another one."""
         if self._use.value != self._chosen:
             self._chosen = self._use.value
             self._operator.choose_model(self._use.value)
 
     def _show_named(self) -> None:
+        """Choose the pose whose button was pressed."""
         self._pose.choose(self._named.value)
         self._refresh()
 
     def _toggle_pose(self) -> None:
+        """Request that the chosen pose be excluded, or included again."""
         name = self._pose.value
         pose = self._snapshot.pose(name) if self._snapshot else None
         if pose is None:
@@ -316,6 +330,7 @@ class Panel(StepPanel):
             self._operator.exclude(name)
 
     def _request_cloud(self) -> None:
+        """Request the chosen cloud; without one, show the calibrated boards."""
         name = self._over.value
         if not name:
             self._painter.cancel("cloud")
@@ -329,13 +344,15 @@ class Panel(StepPanel):
         self._painter.request("cloud", name, lambda: result_views.scan_cloud(context.session, name), self._draw_cloud)
 
     def _draw_cloud(self, cloud: result_views.ScanCloud) -> None:
+        """Draw a cloud, coloured by depth, to choose pixels on."""
         self._cloud = cloud
         self._scene.cloud(LAYER, "cloud", cloud.points, paint(cloud.points[..., 2], "mm", 1, "")[0])
         self._scene.show(LAYER, self._visible)
         if self._visible:
             self._context.viewpoints.show(f"{LAYER} {cloud.name}", cloud.points)
 
-    def _pick(self, origin: np.ndarray, direction: np.ndarray) -> None:
+    def _pick_pixel(self, origin: np.ndarray, direction: np.ndarray) -> None:
+        """Choose the pixel whose point is closest to the clicked ray."""
         cloud = self._cloud
         pixel = None if cloud is None else cloud.nearest(origin, direction)
         if cloud is None or pixel is None:
@@ -347,18 +364,19 @@ class Panel(StepPanel):
 
 
 def fingerprint(calibration: CalibrationView) -> tuple[Any, ...]:
-    """What pictures of a calibration depend on."""
+    """Return a key that changes with the calibration, for its pictures."""
     rig = calibration.stereo.rig
     return calibration.models, rig.camera.K.tobytes(), rig.projector.K.tobytes(), rig.t.tobytes()
 
 
 def worst(calibration: CalibrationView) -> str:
-    """The pose with the largest reprojection error; empty where none is known."""
+    """Return the pose with the largest reprojection error; empty where none is known."""
     errors = calibration.stereo.pose_rms_px
     return max(errors, key=lambda name: max(errors[name]), default="")
 
 
 def _summary(calibration: CalibrationView) -> Html:
+    """Return a table of the calibration: errors, poses, depths, baseline and models."""
     stereo = calibration.stereo
     rms = stereo.reprojection_rms_px
     rows: list[tuple[object, object]] = []
@@ -376,6 +394,7 @@ def _summary(calibration: CalibrationView) -> Html:
 
 
 def _fits(calibration: CalibrationView) -> Html:
+    """Return a table of the pixel-wise fits: median RMS in mm by axis."""
     rows = [
         (f"Axis {axis}", *(f"{medians[name]:.3f}" for name in "zxy"))
         for axis, medians in calibration.fit_rms_mm.items()
@@ -384,6 +403,7 @@ def _fits(calibration: CalibrationView) -> Html:
 
 
 def _parameters(details: CalibrationFigures) -> Html:
+    """Return tables of the lens and rig parameters with their standard deviations."""
     stereo = details.stereo
     lenses = [(f"{name}, {unit}" if unit else name, *values) for name, unit, *values in lens_rows(stereo)]
     rig = [*rig_rows(stereo), ("Target", stereo.board or "imported")]

@@ -60,7 +60,7 @@ SMOOTHING = {"none": 0, "light": 5, "strong": 20}
 
 
 class MeshInputs:
-    """The inputs of a `MeshingPlan`, visible if there is something to mesh."""
+    """Inputs of a `MeshingPlan`, visible if there is something to mesh."""
 
     def __init__(self, context: PanelContext, changed: Callable[[], None]) -> None:
         gui = context.gui
@@ -78,7 +78,7 @@ class MeshInputs:
             handle.on_update(context.callback(changed))
 
     def draw(self, visible: bool, merged: bool) -> None:
-        """Show or hide them; merged points have no pixel grid."""
+        """Show or hide the inputs; merged points have no pixel grid."""
         self._method.offer([(name, text) for name, text in METHODS.items() if not (merged and name == "grid")])
         self._method.set_visible(visible)
         inputs: list[Any] = [self._holes, self._thin, self._smooth]
@@ -88,11 +88,11 @@ class MeshInputs:
 
     @property
     def triangles(self) -> int | None:
-        """The maximum number; None: no limit."""
+        """The maximum number of triangles; None: no limit."""
         return max(4, round(self._thin.value)) if self._thin.value >= 1 else None
 
     def plan(self) -> MeshingPlan:
-        """The chosen plan."""
+        """Return the chosen plan."""
         holes = self._holes.value
         chosen = next((name for name in get_args(Method) if name == self._method.value), None)
         # the pixel grid covers one side only: it is never closed
@@ -102,13 +102,14 @@ class MeshInputs:
 
 
 class Panel(StepPanel):
-    """Exports."""
+    """Panel of the step Export."""
 
     key = "export"
     layers = (LAYER,)
     _points: np.ndarray | None = None
 
     def build(self) -> None:
+        """Create the inputs and lists of files."""
         gui, context, operator = self._gui, self._context, self._operator
         with gui.add_folder("Files"):
             self._files = Text(gui)
@@ -144,6 +145,7 @@ class Panel(StepPanel):
             choice.on_change(context.callback(self._describe))
 
     def draw(self, snapshot: Snapshot) -> None:
+        """Show what a snapshot's session can export, and its files."""
         self._snapshot = snapshot
         session = snapshot.session
         busy = snapshot.is_busy
@@ -165,34 +167,35 @@ class Panel(StepPanel):
         self._describe()
 
     def show(self, visible: bool) -> None:
+        """Show or hide the layers, and move the views to the cloud."""
         super().show(visible)
         self._show_view()
 
-    def _shape(self) -> tuple[What, str]:
-        """What is to be exported, and its name; empty where nothing is offered."""
+    def _get_shape(self) -> tuple[What, str]:
+        """Return what is to be exported, and its name; empty where nothing is offered."""
         name, mesh, session = self._source.value, self._as.value == MESH, self._snapshot and self._snapshot.session
         if name == MERGED:
             return "merged-mesh" if mesh else "merge", session.merge.name if session and session.merge else ""
         return "mesh" if mesh else "cloud", name
 
     def _describe(self) -> None:
-        """Describe the files, link those that exist, and show the shape."""
+        """Describe the chosen files, link those that exist, and request the cloud."""
         session = self._snapshot.session if self._snapshot else None
         if session is None:
             return
         self._request_cloud(session)
-        what, name = self._shape()
+        what, name = self._get_shape()
         mesh = what in ("mesh", "merged-mesh")
         self._mesh.draw(mesh and bool(name), what == "merged-mesh")
         self._shape_format.offer([(each, FORMAT_NAMES[each]) for each in FORMATS[what]])
         if name:
             chosen = self._shape_format.value
-            file = _existing(session, default_file_name(what, name, chosen))
+            file = _get_export(session, default_file_name(what, name, chosen))
             predicted = estimate_file_bytes(
                 what, chosen, *_points(session, name), self._mesh.triangles if mesh else None
             )
-            seen: What = "merged-mesh" if mesh and self._mesh.plan().method != "grid" else what
-            self._shape_note.write(describe_shape_file(session, seen, name, chosen, None if file else predicted), "dim")
+            shown_type: What = "merged-mesh" if mesh and self._mesh.plan().method != "grid" else what
+            self._shape_note.write(describe_shape_file(session, shown_type, name, chosen, None if file else predicted), "dim")
             self._shape_link.set(self._link_html(file))
             self._shape_result.write(self._result_text(file) if file and mesh else "", "dim")
             is_own = file is not None and what == "merge" and chosen == "ply"  # the merge's own file
@@ -206,13 +209,13 @@ class Panel(StepPanel):
         self._number_format.offer([(each, FORMAT_NAMES[each]) for each in FORMATS[numbers]])
         chosen = self._number_format.value
         self._number_note.write(f"{NUMBERS[numbers][1]}. {describe_format(chosen)}.", "dim")
-        file = _existing(session, default_file_name(numbers, "", chosen))
+        file = _get_export(session, default_file_name(numbers, "", chosen))
         self._number_link.set(self._link_html(file))
         label = f"Write {numbers} again" if file else f"Write {numbers}"
         change(self._write_numbers, label=label, color=_button_colour(file))
 
     def _request_cloud(self, session: SessionView) -> None:
-        """Request the cloud of the chosen shape."""
+        """Request the cloud of the chosen source."""
         name, merge, context = self._source.value, session.merge.name if session.merge else "", self._context
         if not name:
             self._painter.cancel("cloud")
@@ -221,6 +224,7 @@ class Panel(StepPanel):
         clouds = {scan.name: (scan.points, scan.model) for scan in session.scans}
 
         def load() -> tuple[np.ndarray, np.ndarray | None]:
+            """Load points (..., 3) mm and colours of the source; None: it has no colours."""
             if name == MERGED:
                 whole = result_views.merged_cloud(context.session, merge)
                 return whole.points, whole.colours
@@ -231,6 +235,7 @@ class Panel(StepPanel):
         self._painter.request("cloud", (name, key), load, self._draw_cloud)
 
     def _draw_cloud(self, made: tuple[np.ndarray, np.ndarray | None]) -> None:
+        """Draw a loaded cloud, grey where it has no colours."""
         points, colours = made
         self._points = points
         self._scene.cloud(LAYER, "cloud", points, (150, 150, 150) if colours is None else colours)
@@ -238,23 +243,27 @@ class Panel(StepPanel):
         self._show_view()
 
     def _show_view(self) -> None:
+        """Move the browsers' views to the cloud, if it is visible."""
         if self._visible:
             self._context.viewpoints.show(f"{LAYER} {self._source.value}", self._points)
 
     # requests
 
     def _request_shape(self) -> None:
-        what, name = self._shape()
+        """Request the file of the chosen cloud or mesh."""
+        what, name = self._get_shape()
         if name:
             plan = self._mesh.plan() if what in ("mesh", "merged-mesh") else None
             self._operator.export(what, name, self._shape_format.value, plan)
 
     def _request_numbers(self) -> None:
+        """Request the file of the chosen numbers: calibration, poses or coefficients."""
         self._operator.export(cast(What, self._numbers.value), "", self._number_format.value)
 
     # files
 
     def _files_html(self, session: SessionView | None) -> Html:
+        """Return a table of the exported files with sizes and download links."""
         exports = session.exports if session else ()
         if not exports:
             return paragraph(coloured("No files yet.", "dim"))
@@ -262,27 +271,28 @@ class Panel(StepPanel):
             (
                 Html(f'<span style="overflow-wrap:anywhere">{to_html(export.name)}</span>'),
                 Html(f'<span style="white-space:nowrap">{format_bytes(export.bytes)}</span>'),
-                self._link(export, "Download", quiet=True),
+                self._format_link(export, "Download", quiet=True),
             )
-            for export in sorted(exports, key=_rank)
+            for export in sorted(exports, key=_rank_export)
         ]
         return Html(f'<div style="max-height:{LIST_PX}px;overflow-y:auto">{table(("File", "Size", ""), rows)}</div>')
 
     def _result_text(self, export: ExportView) -> str:
-        """The notice about this file, without its name; empty where it is no longer among the notices."""
+        """Return the notice about this file, without its name; empty where it is no longer among the notices."""
         notices = reversed(self._snapshot.notices if self._snapshot else ())
         text = next((each.text for each in notices if each.text.startswith(f"{export.name} is ready")), "")
         return text.partition(": ")[2]
 
     def _link_html(self, export: ExportView | None) -> str:
-        """A link to an existing file; empty where there is none."""
+        """Return a link to an existing file; empty where there is none."""
         return (
             ""
             if export is None
-            else paragraph(self._link(export, f"Download {export.name}, {format_bytes(export.bytes)}"))
+            else paragraph(self._format_link(export, f"Download {export.name}, {format_bytes(export.bytes)}"))
         )
 
-    def _link(self, export: ExportView, words: str, quiet: bool = False) -> Html:
+    def _format_link(self, export: ExportView, words: str, quiet: bool = False) -> Html:
+        """Return a download link, plain text if `quiet`, else a button; empty where the file is gone."""
         try:
             address = self._context.offer(export.path)
             return (
@@ -295,7 +305,7 @@ class Panel(StepPanel):
 
 
 def describe_shape_file(session: SessionView, what: What, name: str, file_format: str, size_bytes: int | None) -> str:
-    """The content of a file of a scan or a merge, its units, and its approximate size, where known."""
+    """Describe a file of a scan or merge: its content, units, and approximate size, where known."""
     points, _ = _points(session, name)
     content = {
         "cloud": f"{points:,} points",
@@ -308,23 +318,24 @@ def describe_shape_file(session: SessionView, what: What, name: str, file_format
 
 
 def _points(session: SessionView, name: str) -> tuple[int, str]:
-    """The number of points of a scan or the merge, and a scan's model."""
+    """Return the number of points of a scan or the merge, and a scan's model."""
     scan = next((each for each in session.scans if each.name == name), None)
     if scan is not None:
         return scan.points, scan.model
     return session.merge.points if session.merge else 0, ""
 
 
-def _existing(session: SessionView, name: str) -> ExportView | None:
+def _get_export(session: SessionView, name: str) -> ExportView | None:
+    """Return the exported file called `name`; None where there is none."""
     return next((export for export in session.exports if export.name == name), None)
 
 
 def _button_colour(file: ExportView | None) -> Literal["gray"] | None:
-    """Grey for a file that exists already: it is rather downloaded."""
+    """Return grey for a file that exists already, which is rather downloaded; else the main colour."""
     return None if file is None else "gray"
 
 
-def _rank(export: ExportView) -> tuple[int, str]:
-    """Sort key: merged clouds, then other shapes, then documents."""
+def _rank_export(export: ExportView) -> tuple[int, str]:
+    """Return a sort key: merged clouds, then other shapes, then documents."""
     shaped = Path(export.name).suffix.removeprefix(".").lower() in _SHAPED
     return (0 if export.name.startswith("merged") else 1 if shaped else 2, export.name)

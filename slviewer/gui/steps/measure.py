@@ -30,7 +30,7 @@ _MEASURES: dict[str, Any] = {"Point": add_point, "Distance": add_distance, "Sect
 
 
 class Panel(StepPanel):
-    """Measurements."""
+    """Panel of the step Measure."""
 
     key = "measure"
 
@@ -43,6 +43,7 @@ class Panel(StepPanel):
         self._results = MeasurementList(context, self._painter, LAYER, self._show_measurement)
 
     def build(self) -> None:
+        """Create the inputs of surface, tools and results."""
         gui, context = self._gui, self._context
         with gui.add_folder("Surface", visible=False) as self._surface_folder:
             self._surface.build()
@@ -61,6 +62,7 @@ class Panel(StepPanel):
         self._draw_tool()
 
     def _build_fit(self) -> None:
+        """Create the inputs to fit a shape: radius of the region, and a button."""
         hint = "Of the ball in 3D"
         self._radius: Any = self._gui.add_slider("Radius, mm", 0.5, 100.0, 0.5, 15.0, visible=False, hint=hint)
         self._radius.on_update(self._context.callback(self._draw_ball))
@@ -68,6 +70,7 @@ class Panel(StepPanel):
         self._fit = self._context.button("Fit", self._request_fit, viser.Icon.CHECK, None, visible=False)
 
     def _build_relation(self) -> None:
+        """Create the inputs to measure between two results."""
         self._from, self._to = Choice(self._gui, "From"), Choice(self._gui, "To")
         self._relate = self._context.button(
             "Measure relation",
@@ -78,6 +81,7 @@ class Panel(StepPanel):
         )
 
     def _build_deviation(self) -> None:
+        """Create the inputs to upload a nominal model and compare with it."""
         gui, context, operator = self._gui, self._context, self._operator
         with gui.add_folder(None, visible=False) as self._nominal_folder:  # viser cannot hide upload buttons alone
             upload = gui.add_upload_button(
@@ -92,6 +96,7 @@ class Panel(StepPanel):
             self._compare = context.button("Compare", self._request_comparison, viser.Icon.ARROWS_DIFF, None)
 
     def draw(self, snapshot: Snapshot) -> None:
+        """Show the surfaces and measurements of a snapshot."""
         with self._lock:
             session = snapshot.session
             usable = session is not None and snapshot.step(self.key).state != "blocked"
@@ -107,6 +112,7 @@ class Panel(StepPanel):
             change(self._fit, disabled=snapshot.is_busy)
 
     def show(self, visible: bool) -> None:
+        """Show or hide the panel's layer; the tool is reset, and clicks are ignored until one is selected."""
         with self._lock:
             self._tool.select("")
             self._draw_tool()
@@ -118,16 +124,17 @@ class Panel(StepPanel):
     # tools
 
     def _select_tool(self, name: str) -> None:
+        """Select a tool by name; empty: none."""
         with self._lock:
             self._tool.select(name)
-            self._listen()  # before the instruction appears, so that no click is lost
+            self._listen_for_clicks()  # before the instruction appears, so that no click is lost
             self._draw_tool()
 
-    def _listen(self) -> None:
-        """React to clicks into the scene while the tool needs them; another step's clicks are its own."""
+    def _listen_for_clicks(self) -> None:
+        """React to clicks into the scene while the tool needs them; another step handles its own clicks."""
         if self._visible:
             change(self._escape, disabled=not self._tool.name)
-            self._scene.on_pick(self._click if self._tool.clicks and not self._obstacle else None)
+            self._scene.on_pick(self._handle_click if self._tool.clicks and not self._obstacle else None)
 
     @property
     def _obstacle(self) -> str:
@@ -137,10 +144,12 @@ class Panel(StepPanel):
             return ""
         return "This merge has no triangles to cut: measure on one of its scans."
 
-    def _click(self, origin: np.ndarray, direction: np.ndarray) -> None:
+    def _handle_click(self, origin: np.ndarray, direction: np.ndarray) -> None:
+        """Pick the point of the surface that a clicked ray meets."""
         self._context.callback(lambda: self._surface.pick(origin, direction, self._add_pick))(None)
 
     def _add_pick(self, place: Place) -> None:
+        """Add a picked point to the tool, and request the measurement once it has enough."""
         with self._lock:
             if not self._tool.clicks:
                 return
@@ -151,7 +160,7 @@ class Panel(StepPanel):
         self._operator.measure(on, _MEASURES[self._tool.name], *places)
 
     def _draw_tool(self) -> None:
-        """The instruction and the inputs of the tool, and the points picked with it."""
+        """Show the instruction and the inputs of the tool, and the points picked with it."""
         tool = self._tool
         title = f"<b>{to_html(tool.name)}</b>: " if tool.name else ""
         text = Html(title + to_html(self._obstacle or tool.instruction))
@@ -176,9 +185,9 @@ class Panel(StepPanel):
         self._draw_ball()
 
     def _draw_ball(self) -> None:
-        """The region that a shape would be fitted to, and its number of points."""
+        """Draw the region that a shape would be fitted to, and request its number of points."""
         with self._lock:
-            on, region = self._surface.on, self._region()
+            on, region = self._surface.on, self._make_region()
             if on is None or region is None or region.centre is None:
                 self._painter.cancel("inside")
                 self._scene.remove(LAYER, _BALL)
@@ -194,7 +203,8 @@ class Panel(StepPanel):
                 lambda points: self._inside.write(f"{points:,} points in the ball", "dim"),
             )
 
-    def _region(self) -> Region | None:
+    def _make_region(self) -> Region | None:
+        """Return the ball around the picked point; None unless the tool fits a shape and has one."""
         on = self._surface.on
         if on is None or not self._tool.fits or not self._tool.picked:
             return None
@@ -203,7 +213,7 @@ class Panel(StepPanel):
     # the surface and the results
 
     def _handle_loaded(self) -> None:
-        """Another surface is shown: picked points are dropped, and the ball fits its size."""
+        """Handle that another surface is shown: drop picked points, and adapt the ball to its size."""
         with self._lock:
             on = self._surface.on
             assert on is not None
@@ -225,6 +235,7 @@ class Panel(StepPanel):
     # requests
 
     def _offer_inputs(self, session: SessionView | None) -> None:
+        """Offer the results to relate, by default the latest two, and the nominal models."""
         measured = session.measurements if session else ()
         related = [(each.id, each.name) for each in measured if each.kind in KINDS and not each.stale]
         for choice in (self._from, self._to):
@@ -237,12 +248,14 @@ class Panel(StepPanel):
         self._nominal.offer([(name, name) for name in (session.nominals if session else ())])
 
     def _request_fit(self) -> None:
+        """Request the fit of the tool's shape to the region."""
         with self._lock:
-            region, shape = self._region(), cast(Shape, self._tool.name.lower())
+            region, shape = self._make_region(), cast(Shape, self._tool.name.lower())
         if region is not None:
             self._operator.measure(self._surface.name, add_fit, shape, region)
 
     def _request_comparison(self) -> None:
+        """Request the comparison with the chosen nominal model."""
         units = None if self._units.value == UNKNOWN else self._units.value
         tolerance = float(self._tolerance.value) or None
         self._operator.compare_nominal(self._surface.name, self._nominal.value, units, tolerance)

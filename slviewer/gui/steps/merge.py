@@ -22,7 +22,7 @@ _CURRENT_NOTE = "For scans between which neither the object nor the camera moved
 
 
 class Panel(StepPanel):
-    """The merge."""
+    """Panel of the step Merge."""
 
     key = "merge"
 
@@ -35,6 +35,7 @@ class Panel(StepPanel):
         self._layer_shown: bool | None = None
 
     def build(self) -> None:
+        """Create the inputs of scans, alignment and view."""
         gui, context, operator = self._gui, self._context, self._operator
         with gui.add_folder("Scans") as self._scans_folder:
             self._none = Text(gui)
@@ -58,13 +59,14 @@ class Panel(StepPanel):
         self._view = Choice(gui, "3D view")
         self._view.on_change(context.callback(self._refresh))
         self._legend = Text(gui)
-        context.view_button(self._shown_points)
+        context.view_button(self._get_shown_points)
 
     def draw(self, snapshot: Snapshot) -> None:
+        """Show the scans and the merge of a snapshot."""
         with self._lock:
             self._snapshot = snapshot
             session = snapshot.session
-            scans = _mergeable(session) if session else []
+            scans = _list_mergeable(session) if session else []
             self._draw_boxes(scans)
             merge = session.merge if session else None
             preferred = merge.reference if merge else scans[-1].name if scans else ""
@@ -83,6 +85,7 @@ class Panel(StepPanel):
             self._refresh()
 
     def show(self, visible: bool) -> None:
+        """Show or hide the panel's layers."""
         with self._lock:
             self._visible = visible
             self._show_layers()
@@ -90,7 +93,7 @@ class Panel(StepPanel):
     # drawing
 
     def _draw_boxes(self, scans: list[ScanView]) -> None:
-        """One check box per scan, added and removed as scans come and go."""
+        """Update the check boxes, one per scan."""
         names, labels = [scan.name for scan in scans], [scan.label for scan in scans]
         self._none.write("" if scans else "No reconstructed scan yet: capture two or more in the step Scan.", "warning")
         for name in [name for name in self._boxes if name not in names]:
@@ -105,6 +108,7 @@ class Panel(StepPanel):
             change(self._boxes[scan.name], label=label)
 
     def _offer_views(self, merge: MergeView | None) -> None:
+        """Offer the 3D views: before and after the merge, merged, or side by side to pick points."""
         views = [BEFORE] if merge is None else [AFTER, BEFORE, *MERGED]
         if self._start.value == PICKED:
             views.append(SIDE_BY_SIDE)
@@ -112,35 +116,38 @@ class Panel(StepPanel):
         self._view.set_visible(len(views) > 1)
 
     def _change_start(self) -> None:
+        """Update the views for another initial alignment; picked points are shown side by side."""
         with self._lock:
             self._offer_views(self._snapshot.session.merge if self._snapshot and self._snapshot.session else None)
             if self._start.value == PICKED:
                 self._view.choose(SIDE_BY_SIDE)
             self._refresh()
 
-    def _chosen(self) -> list[str]:
-        """The scans to merge, with the reference, in the order of their capture."""
-        scans = _mergeable(self._snapshot.session) if self._snapshot and self._snapshot.session else []
+    def _list_chosen(self) -> list[str]:
+        """List the scans to merge, with the reference, in the order of their capture."""
+        scans = _list_mergeable(self._snapshot.session) if self._snapshot and self._snapshot.session else []
         boxes, reference = self._boxes, self._reference.value
         return [s.name for s in scans if s.name == reference or (s.name in boxes and boxes[s.name].value)]
 
-    def _shown_points(self) -> np.ndarray | None:
+    def _get_shown_points(self) -> np.ndarray | None:
+        """Return the shown points (n, 3) mm; None where none are."""
         if self._is_picking:
             return self._picker.points
         return None if self._clouds is None else self._clouds.points
 
     @property
     def _is_picking(self) -> bool:
+        """Whether points are picked on two scans side by side."""
         return bool(self._start.value == PICKED and self._view.value == SIDE_BY_SIDE)
 
     def _refresh(self) -> None:
-        """Offer what can be merged now, and request the clouds."""
+        """Update inputs and notes for the current choice, and request the clouds."""
         with self._lock:
             snapshot = self._snapshot
             session = snapshot.session if snapshot else None
             if snapshot is None or session is None:
                 return
-            names, start = self._chosen(), self._start.value
+            names, start = self._list_chosen(), self._start.value
             versions = {scan.name: (scan.points, scan.model) for scan in session.scans if scan.cloud != "absent"}
             labels = {scan.name: scan.label for scan in session.scans}
             change(self._angle, visible=start == TURNTABLE)
@@ -159,6 +166,7 @@ class Panel(StepPanel):
     def _request_clouds(
         self, session: SessionView, names: list[str], versions: dict[str, tuple[int, str]], labels: dict[str, str]
     ) -> None:
+        """Request the clouds of the chosen view."""
         merge, view, context = session.merge, self._view.value, self._context
         shown = [name for name in (merge.scans if merge is not None else names) if name in versions]
         poses = {name: pair[2] for name, pair in merge.pairs.items()} if merge is not None and view == AFTER else {}
@@ -170,6 +178,7 @@ class Panel(StepPanel):
         )
 
         def make() -> ColouredClouds:
+            """Load and colour the merged surface or the scans."""
             if merge is not None and view in MERGED:
                 return colour_merge(context.session, merge.name, view, [labels.get(name, name) for name in merge.scans])
             return colour_scans(context.session, shown, poses, labels)
@@ -177,6 +186,7 @@ class Panel(StepPanel):
         self._painter.request("clouds", key, make, self._draw_clouds)
 
     def _draw_clouds(self, clouds: ColouredClouds) -> None:
+        """Draw the loaded clouds, and remove others."""
         for name in set(self._scene.names(LAYER)) - set(clouds.clouds):
             self._scene.remove(LAYER, name)
         for name, (points, painted) in clouds.clouds.items():
@@ -186,7 +196,7 @@ class Panel(StepPanel):
             self._show_layers()
 
     def _show_layers(self) -> None:
-        """Show the clouds, or the two to pick on."""
+        """Show the clouds, or the two scans to pick on, with their legend."""
         picking = self._is_picking
         shown = self._visible and not picking
         if self._layer_shown != shown:
@@ -198,7 +208,13 @@ class Panel(StepPanel):
             self._context.viewpoints.show(f"{LAYER} {self._clouds.view}", self._clouds.points)
 
     def _request_merge(self) -> None:
-        merge, start, reference, names = self._operator.merge, self._start.value, self._reference.value, self._chosen()
+        """Request the merge of the chosen scans by the chosen initial alignment."""
+        merge, start, reference, names = (
+            self._operator.merge,
+            self._start.value,
+            self._reference.value,
+            self._list_chosen(),
+        )
         if start == TURNTABLE:
             merge(names, reference, start="turntable", angle=float(self._angle.value))
         elif start == CURRENT:
@@ -209,6 +225,6 @@ class Panel(StepPanel):
             merge(names, reference)
 
 
-def _mergeable(session: SessionView) -> list[ScanView]:
-    """Reconstructed scans of objects, without captured planes and spheres."""
+def _list_mergeable(session: SessionView) -> list[ScanView]:
+    """List the reconstructed scans of objects, without captured planes and spheres."""
     return [scan for scan in session.scans if scan.cloud != "absent" and shape_of(scan) == "scan"]

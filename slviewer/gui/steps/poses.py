@@ -26,9 +26,9 @@ _TILTS = {(1, 1): "●", (0, 1): "▲", (1, 2): "▶", (2, 1): "▼", (1, 0): "�
 
 
 def coverage_chart(coverage: Coverage) -> Html:
-    """Three small charts side by side; a field is full once GOAL_POSES poses cover it."""
+    """Return three small charts side by side; a field is full once GOAL_POSES poses cover it."""
     depths = "".join(
-        f'<div style="display:flex;align-items:center;gap:0.4em">{_field(n, 44, 15)}<span>{name}</span></div>'
+        f'<div style="display:flex;align-items:center;gap:0.4em">{_draw_field(n, 44, 15)}<span>{name}</span></div>'
         for name, n in zip(("near", "middle", "far"), coverage.depths, strict=True)
     )
     tilts = np.full((3, 3), -1)
@@ -38,9 +38,9 @@ def coverage_chart(coverage: Coverage) -> Html:
     charts = "".join(
         f'<div><div style="color:var(--mantine-color-dimmed);margin-bottom:0.2em">{to_html(title)}</div>{chart}</div>'
         for title, chart in (
-            ("Image", _grid(coverage.cells)),
+            ("Image", _draw_grid(coverage.cells)),
             (f"Depth, {near:.0f}–{far:.0f} mm", depths),
-            ("Tilt", _grid(tilts, _TILTS)),
+            ("Tilt", _draw_grid(tilts, _TILTS)),
         )
     )
     title = coloured(f"Coverage {100 * coverage.share:.0f} %", "good" if coverage.share > 0.9 else "plain", bold=True)
@@ -49,24 +49,26 @@ def coverage_chart(coverage: Coverage) -> Html:
     )
 
 
-def _grid(counts: np.ndarray, marks: dict[tuple[int, int], str] | None = None) -> str:
+def _draw_grid(counts: np.ndarray, marks: dict[tuple[int, int], str] | None = None) -> str:
+    """Return a chart of counts (rows, columns), with a mark in some fields; -1: no field."""
     rows = "".join(
         '<div style="display:flex;gap:2px;margin-bottom:2px">'
-        + "".join(_field(n, 17, 17, (marks or {}).get((i, j), "")) for j, n in enumerate(row))
+        + "".join(_draw_field(n, 17, 17, (marks or {}).get((i, j), "")) for j, n in enumerate(row))
         + "</div>"
         for i, row in enumerate(counts)
     )
     return f"<div>{rows}</div>"
 
 
-def _field(count: int, width: int, height: int, mark: str = "") -> str:
+def _draw_field(count: int, width: int, height: int, mark: str = "") -> str:
+    """Return one field of a chart, coloured by its count; transparent where negative."""
     colour = "transparent" if count < 0 else _COLOURS[min(int(count), GOAL_POSES)]
     style = f"width:{width}px;height:{height}px;border-radius:2px;background:{colour};font-size:9px"
     return f'<div style="{style};line-height:{height}px;text-align:center">{mark}</div>'
 
 
 class Panel(StepPanel):
-    """Target poses."""
+    """Panel of the step Poses."""
 
     key = "poses"
     layers = (LAYER, WORLD)
@@ -83,8 +85,9 @@ class Panel(StepPanel):
         self._target = self._latest = ""
 
     def build(self) -> None:
+        """Create the live image, the buttons, the coverage and the list of poses."""
         gui, context, operator = self._gui, self._context, self._operator
-        self._boards = PoseBoards(context.scene, LAYER, self._select)
+        self._boards = PoseBoards(context.scene, LAYER, self._select_pose)
         self._picture = Picture(gui)
         self._countdown = Text(gui)
         self._other_object = Text(gui)
@@ -116,12 +119,13 @@ class Panel(StepPanel):
             self._chosen.on_change(context.callback(self._draw_choice))
             self._detail = Text(gui)
             actions = gui.add_button_group("Action", ("Exclude", "Include", "Retake", "Delete"))
-            actions.on_click(context.callback(lambda: self._act(actions.value)))
+            actions.on_click(context.callback(lambda: self._request_action(actions.value)))
             self._restore = RestoreButton(context)
         self._import = ImportInputs(context, "calibration")
         self._sound = Sound(gui)
 
     def draw(self, snapshot: Snapshot) -> None:
+        """Show the poses, coverage and suggestion of a snapshot."""
         session = snapshot.session
         target = session.target if session else ""
         if target != self._target:
@@ -151,6 +155,7 @@ class Panel(StepPanel):
         self._draw_choice(snapshot)
 
     def draw_preview(self, preview: PreviewView) -> None:
+        """Show the live image with the detected board, and the countdown of a hands-free capture."""
         hint = coloured("Dashed blue: hold the board here", "info") if self._ghost_px is not None else Html("")
         self._picture.set(
             draw_preview(preview, self._board, self._ghost_px),
@@ -167,6 +172,7 @@ class Panel(StepPanel):
         self._is_counting = count is not None
 
     def show(self, visible: bool) -> None:
+        """Show or hide the layers; the hotkey works only while shown."""
         super().show(visible)
         self._hotkey.disabled = not visible
         self._session = None
@@ -174,6 +180,7 @@ class Panel(StepPanel):
     # drawing
 
     def _draw_accuracy(self, session: SessionView | None) -> None:
+        """Show the predicted standard deviation and the goal."""
         if session is None or session.plan is None or session.plan.sigma_mm is None:
             self._accuracy.set("")
         else:
@@ -188,6 +195,7 @@ class Panel(StepPanel):
             self._wanted_value.update(round(session.wanted_mm, 3))
 
     def _draw_ghost(self, session: SessionView | None) -> None:
+        """Draw the suggested pose in 3D, and store its outline for the live image."""
         suggestion = session.suggestion if session and not session.enough else None
         self._ghost_px = suggestion.outline_px if suggestion else None
         if suggestion is None or self._board is None:
@@ -199,7 +207,7 @@ class Panel(StepPanel):
             )
 
     def _draw_world(self, snapshot: Snapshot) -> None:
-        """The simulated board and its handle."""
+        """Draw the simulated board and its handle, or which other object is in view."""
         world, scene = snapshot.world, self._scene
         other = "" if world is None or world.standing == "board" else world.standing
         self._other_object.write(other and f"In view: the {other}. Place the board first.", "warning")
@@ -208,10 +216,10 @@ class Panel(StepPanel):
                 scene.clear(WORLD)
                 self._world = None
             return
-        T, centre = world.T_camera_object, self._board_centre(self._board)
+        T, centre = world.T_camera_object, self._get_board_centre(self._board)
         if self._world is None:
             scene.board(WORLD, "board", T, self._board.outline(), (70, 70, 70), width_px=3.0)
-            scene.gizmo(WORLD, "handle", T @ centre, self._drag, self._drop)
+            scene.gizmo(WORLD, "handle", T @ centre, self._drag_board, self._place_board)
         elif not np.array_equal(T, self._world):
             scene.move(WORLD, "board", T)
             if time.monotonic() - self._dragged > _QUIET_S:
@@ -219,7 +227,7 @@ class Panel(StepPanel):
         self._world = T
 
     def _draw_choice(self, snapshot: Snapshot | None = None) -> None:
-        """The chosen pose in full, and all poses in 3D."""
+        """Show the details of the chosen pose, and all poses in 3D."""
         snapshot = snapshot or self._operator.snapshot()
         poses = snapshot.session.poses if snapshot.session else ()
         self._boards.draw(poses, self._board, snapshot.rig.camera, self._chosen.value)
@@ -242,7 +250,7 @@ class Panel(StepPanel):
         self._detail.set(paragraph(Html(f'<div style="display:flex;gap:0.8em">{picture}<div>{text}</div></div>')))
 
     def _play_sound(self, poses: tuple[PoseView, ...], hands_free: bool) -> None:
-        """Signal the result of the last pose to the operator, who is looking at the board."""
+        """Play a sound for the result of the last pose, as the operator is looking at the board."""
         states: dict[str, str] = {pose.name: pose.state for pose in poses}
         if hands_free and self._states:
             news = [state for name, state in states.items() if self._states.get(name, "") != state]
@@ -256,11 +264,13 @@ class Panel(StepPanel):
 
     # requests
 
-    def _select(self, name: str) -> None:
+    def _select_pose(self, name: str) -> None:
+        """Choose a pose by its name."""
         self._chosen.choose(name)
         self._draw_choice()
 
-    def _act(self, action: str) -> None:
+    def _request_action(self, action: str) -> None:
+        """Request the action of a button for the chosen pose: exclude, include, retake or delete."""
         name, operator = self._chosen.value, self._operator
         if not name:
             self._context.notify("info", "Capture a pose first.")
@@ -273,19 +283,21 @@ class Panel(StepPanel):
         else:
             operator.delete(name)
 
-    def _drag(self, T_camera_centre: np.ndarray) -> None:
+    def _drag_board(self, T_camera_centre: np.ndarray) -> None:
+        """Move the simulated board while its handle is dragged, at most every `_DRAG_S`."""
         self._dragged = time.monotonic()
         if self._dragged - self._sent > _DRAG_S:
             self._sent = self._dragged
-            self._drop(T_camera_centre)
+            self._place_board(T_camera_centre)
 
-    def _drop(self, T_camera_centre: np.ndarray) -> None:
+    def _place_board(self, T_camera_centre: np.ndarray) -> None:
+        """Place the simulated board where its handle is, T (4, 4) mm of the board's centre."""
         if self._board is not None:
-            self._operator.place("board", T_camera_centre @ np.linalg.inv(self._board_centre(self._board)))
+            self._operator.place("board", T_camera_centre @ np.linalg.inv(self._get_board_centre(self._board)))
 
     @staticmethod
-    def _board_centre(board: Board) -> np.ndarray:
-        """T_board_centre (4, 4): the handle is at the board's centre."""
+    def _get_board_centre(board: Board) -> np.ndarray:
+        """Return T_board_centre (4, 4) mm, as the handle is at the board's centre."""
         T = np.eye(4)
         T[:3, 3] = board.outline().mean(axis=0)
         return T

@@ -16,13 +16,14 @@ _SETTLES_S = 1.5  # an exposure that is being dragged is not set back to what th
 
 
 class Panel(StepPanel):
-    """The rig."""
+    """Panel of the step Rig."""
 
     key = "rig"
     _drawn: RigView | None = None
     _entered = 0.0
 
     def build(self) -> None:
+        """Create the inputs of devices, exposure, light and check."""
         gui, context = self._gui, self._context
         self._rig = RigChoice(context)
         self._picture = Picture(gui, "Live image")
@@ -37,6 +38,7 @@ class Panel(StepPanel):
         self._check = RigCheck(context)
 
     def draw(self, snapshot: Snapshot) -> None:
+        """Show the rig of a snapshot."""
         self._rig.draw(snapshot)
         self._check.draw(snapshot)
         rig = snapshot.rig
@@ -54,6 +56,7 @@ class Panel(StepPanel):
         self._drawn = rig
 
     def _draw_exposure(self, rig: RigView) -> None:
+        """Set the slider to the rig's exposure, unless it was moved a moment ago."""
         if rig.exposure_ms is not None and time.monotonic() - self._entered > _SETTLES_S:
             while rig.exposure_ms > self._exposure.max:
                 self._exposure.max *= 4
@@ -61,21 +64,25 @@ class Panel(StepPanel):
                 change(self._exposure, value=round(rig.exposure_ms, 2))
 
     def draw_preview(self, preview: PreviewView) -> None:
+        """Show the live image and its histogram."""
         self._draw_exposure(self._operator.snapshot().rig)
         self._picture.set(draw_preview(preview), legend(preview, exposure_html(preview)))
         self._histogram.set(histogram_chart(preview))
 
     def _set_exposure(self) -> None:
+        """Request the exposure of the slider."""
         self._entered = time.monotonic()
         self._operator.set_exposure(float(self._exposure.value))
 
     def _step_exposure(self, direction: str) -> None:
+        """Request an exposure a third of a stop higher ("Brighter") or lower."""
         now = self._operator.snapshot().rig.exposure_ms
         if now is not None:
             self._entered = 0.0
             self._operator.set_exposure(now * _THIRD_OF_A_STOP if direction == "Brighter" else now / _THIRD_OF_A_STOP)
 
     def _set_light(self) -> None:
+        """Request the chosen light; where it is refused, show the current one again."""
         if not self._operator.set_light(LIGHTS[self._light.value]):
             now = self._operator.snapshot().rig.light
             change(self._light, value=next(label for label, light in LIGHTS.items() if light == now))

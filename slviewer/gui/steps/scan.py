@@ -42,7 +42,7 @@ _STATES = {"absent": "not reconstructed", "fresh": "", "stale": "older calibrati
 
 
 class Panel(StepPanel):
-    """Scans."""
+    """Panel of the step Scan."""
 
     key = "scan"
     layers = (LAYER,)
@@ -57,6 +57,7 @@ class Panel(StepPanel):
         context.operator.subscribe_live(self._screen.offer)
 
     def build(self) -> None:
+        """Create the inputs of capture, live scan, gallery and cloud."""
         gui, context, operator = self._gui, self._context, self._operator
         with gui.add_folder("Capture", visible=False) as self._capture_folder:
             self._picture = Picture(gui, "Live image", width_px=SMALL_PX)
@@ -99,6 +100,7 @@ class Panel(StepPanel):
         self._colour.on_update(context.callback(self._refresh))
 
     def draw(self, snapshot: Snapshot) -> None:
+        """Show the scans and the live scan of a snapshot."""
         with self._lock:
             self._snapshot = snapshot
             session, rig = snapshot.session, snapshot.rig
@@ -128,19 +130,21 @@ class Panel(StepPanel):
             self._refresh()
 
     def draw_preview(self, preview: PreviewView) -> None:
+        """Show the live image."""
         self._picture.set(draw_preview(preview), legend(preview, exposure_html(preview)))
 
     def show(self, visible: bool) -> None:
+        """Show or hide the layers; hiding stops a live scan."""
         super().show(visible)
         if not visible:
             self._operator.stop_live()
-        self._scene.on_pick(self._pick if visible else None)
+        self._scene.on_pick(self._show_point if visible else None)
         self._show_view()
 
     # drawing
 
     def _draw_live(self, live: LiveView | None, ready: bool) -> None:
-        """The buttons and figures of the live scan, which hides a captured cloud meanwhile."""
+        """Update buttons and figures of the live scan, during which a captured cloud is hidden."""
         icon = viser.Icon.PLAYER_PLAY if live is None else viser.Icon.PLAYER_STOP
         label, colour = ("Live", "teal") if live is None else ("Stop live", "red")
         change(self._live, label=label, color=colour, icon=icon, disabled=live is None and not ready)
@@ -154,12 +158,14 @@ class Panel(StepPanel):
             self._clear_cloud()
 
     def _toggle_live(self) -> None:
+        """Start the live scan, or stop it where it runs."""
         if self._is_live:
             self._operator.stop_live()
         else:
             self._operator.start_live()
 
     def _clear_cloud(self) -> None:
+        """Remove the captured cloud with its legend and picked point."""
         self._painter.cancel("cloud")
         self._cloud = None
         for name in ("cloud", "picked"):
@@ -189,6 +195,7 @@ class Panel(StepPanel):
             colour = self._colour.value
 
             def make() -> tuple[ScanCloud, str]:
+                """Load the cloud, unless it is loaded already; returns it and the chosen colours."""
                 if self._loaded is None or self._loaded[0] != key:
                     self._loaded = key, scan_cloud(self._context.session, scan.name)
                 return self._loaded[1], colour
@@ -196,6 +203,7 @@ class Panel(StepPanel):
             self._painter.request("cloud", (key, colour), make, self._draw_cloud)
 
     def _draw_cloud(self, made: tuple[ScanCloud, str]) -> None:
+        """Draw a loaded cloud in the chosen colours, unless a live scan runs."""
         cloud, colour = made
         if self._is_live:
             return
@@ -212,10 +220,12 @@ class Panel(StepPanel):
         self._show_view()
 
     def _show_view(self) -> None:
+        """Move the browsers' views to the cloud, if it is visible."""
         if self._visible and self._cloud is not None:
             self._context.viewpoints.show(f"{LAYER} {self._cloud.name}", self._cloud.points)
 
-    def _pick(self, origin: np.ndarray, direction: np.ndarray) -> None:
+    def _show_point(self, origin: np.ndarray, direction: np.ndarray) -> None:
+        """Show the values of the point closest to the clicked ray."""
         cloud = self._cloud
         pixel = None if cloud is None else cloud.nearest(origin, direction)
         if cloud is None or pixel is None:
@@ -226,7 +236,7 @@ class Panel(StepPanel):
 
 
 def live_html(live: LiveView, shown: int) -> Html:
-    """Rate and latency of the live clouds."""
+    """Describe rate and latency of the live clouds."""
     if not live.clouds_per_s:
         return paragraph(coloured("Waiting for the first cloud …", "dim"))
     latency = "" if live.latency_ms is None else f", latency {live.latency_ms:.0f} ms"
@@ -244,7 +254,7 @@ def live_html(live: LiveView, shown: int) -> Html:
 
 
 def painting(cloud: ScanCloud, colour: str) -> tuple[np.ndarray, Html]:
-    """((h, w) grey levels or (h, w, 3) RGB, uint8; the legend) of a cloud in one of COLOURS."""
+    """Colour a cloud by one of COLOURS: ((h, w) grey levels or (h, w, 3) RGB, uint8; the legend)."""
     if colour == "error":
         if not cloud.errors:
             grey = np.full(cloud.points.shape, 150, np.uint8)
@@ -270,7 +280,7 @@ def painting(cloud: ScanCloud, colour: str) -> tuple[np.ndarray, Html]:
 
 
 def uncertainty(cloud: ScanCloud) -> np.ndarray:
-    """(h, w) mm: the standard deviation of z from noise, calibration and edges, as far as they are known."""
+    """Return the standard deviation of z (h, w) mm from noise, calibration and edges, as far as known."""
     sigma = np.where(np.isfinite(cloud.points[..., 2]), cloud.sigma_z, np.nan)
     for part in (cloud.sigma_calibration, cloud.sigma_edges):
         sigma = sigma if part is None else np.hypot(sigma, part)
@@ -278,7 +288,7 @@ def uncertainty(cloud: ScanCloud) -> np.ndarray:
 
 
 def point_html(cloud: ScanCloud, u: int, v: int) -> Html:
-    """All values at pixel (u, v)."""
+    """Return a table of all values at pixel (u, v)."""
     x, y, z = cloud.points[v, u]
     rows: list[tuple[object, object]] = [
         ("Pixel (u, v)", f"({u}, {v})"),
@@ -295,7 +305,7 @@ def point_html(cloud: ScanCloud, u: int, v: int) -> Html:
 
 
 def scan_html(scan: ScanView) -> Html:
-    """A scan's figures."""
+    """Return a table of a scan's figures, with warnings."""
     if scan.cloud == "absent":
         return paragraph(coloured("Not reconstructed yet.", "warning"))
     rows: list[tuple[object, object]] = [("Points", f"{scan.points:,}"), ("Model", scan.model)]
@@ -316,12 +326,12 @@ def scan_html(scan: ScanView) -> Html:
 
 
 def sort_scans(scans: Sequence[ScanView]) -> list[ScanView]:
-    """Scans of objects first, then captures of planes and spheres; the newest of each first."""
+    """Sort scans of objects first, then captures of planes and spheres; the newest of each first."""
     return sorted(reversed(scans), key=lambda scan: shape_of(scan) != "scan")
 
 
 def gallery(scans: Sequence[ScanView], chosen: str) -> Html:
-    """Thumbnails of the scans with their names."""
+    """Return thumbnails of the scans with their names; the chosen one is framed."""
     if not scans:
         return Html("")
     cards = []

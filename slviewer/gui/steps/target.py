@@ -29,7 +29,7 @@ _EXPLANATIONS = {
 
 
 class Panel(StepPanel):
-    """The board."""
+    """Panel of the step Target."""
 
     key = "target"
     _target = ""
@@ -37,6 +37,7 @@ class Panel(StepPanel):
     _folder: Path | None = None
 
     def build(self) -> None:
+        """Create the fields of the board, and the live image."""
         gui, context = self._gui, self._context
         board = Board.parse(EXAMPLES["circles"])
         self._kind = gui.add_dropdown("Board", tuple(KINDS))
@@ -47,7 +48,7 @@ class Panel(StepPanel):
         self._dictionary = gui.add_dropdown("Dictionary", DICTIONARIES, visible=False)
         self._note = Text(gui)
         self._use = context.button(
-            "Use this board", lambda: self._operator.choose_target(str(self._entered())), viser.Icon.CHECK, None
+            "Use this board", lambda: self._operator.choose_target(str(self._parse_entered())), viser.Icon.CHECK, None
         )
         context.button("Create PDF", self._write_sheet, viser.Icon.PRINTER, hint="To print the board to scale")
         self._sheet = Text(gui)
@@ -57,6 +58,7 @@ class Panel(StepPanel):
         self._kind.on_update(context.callback(self._change_kind, by_user=True))
 
     def draw(self, snapshot: Snapshot) -> None:
+        """Show the board of a snapshot's session."""
         session = snapshot.session
         target, folder = (session.target, session.folder) if session else ("", None)
         if folder != self._folder:
@@ -66,21 +68,23 @@ class Panel(StepPanel):
             self._target = target
             self._board = Board.parse(target) if target else None
             if self._board is not None:
-                self._fill(self._board)
+                self._fill_fields(self._board)
         self._describe()
 
     def draw_preview(self, preview: PreviewView) -> None:
+        """Show the live image with the detected board."""
         text = legend(preview, board_html(preview, self._board), exposure_html(preview))
         self._picture.set(draw_preview(preview, self._board), text)
 
-    def _entered(self) -> Board:
-        """The board that the fields describe. Raises InputError where there is none such."""
+    def _parse_entered(self) -> Board:
+        """Return the board that the fields describe. Raises InputError for an invalid one."""
         kind = KINDS[self._kind.value]
         notation = f"{kind}:{int(self._columns.value)}x{int(self._rows.value)}:{self._pitch.value:g}"
         markers = f":{self._marker.value:g}:{self._dictionary.value}" if kind == "charuco" else ""
         return Board.parse(notation + markers)
 
-    def _fill(self, board: Board) -> None:
+    def _fill_fields(self, board: Board) -> None:
+        """Fill the fields from a board."""
         change(self._kind, value=next(label for label, kind in KINDS.items() if kind == board.kind))
         change(self._columns, value=board.columns)
         change(self._rows, value=board.rows)
@@ -93,13 +97,14 @@ class Panel(StepPanel):
             change(self._dictionary, value=board.dictionary)
 
     def _change_kind(self) -> None:
-        self._fill(Board.parse(EXAMPLES[KINDS[self._kind.value]]))
+        """Fill the fields with an example of the chosen kind of board."""
+        self._fill_fields(Board.parse(EXAMPLES[KINDS[self._kind.value]]))
         self._describe()
 
     def _describe(self) -> None:
-        """What the fields mean, and whether that is the session's board."""
+        """Describe the entered board, and whether it is the session's."""
         try:
-            board = self._entered()
+            board = self._parse_entered()
         except InputError as error:
             self._note.set(alert(str(error), "error"))
             return
@@ -114,7 +119,8 @@ class Panel(StepPanel):
         self._note.set(paragraph(Html(f"{explanation}<br>{state}")))
 
     def _write_sheet(self) -> None:
-        board = self._entered()
+        """Write a PDF of the entered board into the exports, and link it."""
+        board = self._parse_entered()
         path = self._context.session.exports / f"{str(board).replace(':', '_')}.pdf"
         write_target(str(board), path)
         note = to_html("Print at 100 %, glue it to a flat plate, and measure the scale bar.")

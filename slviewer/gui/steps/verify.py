@@ -35,7 +35,7 @@ _SIGN = {"plane": "red is towards the camera", "sphere": "red is outwards"}
 
 
 class Panel(StepPanel):
-    """Verification."""
+    """Panel of the step Verify."""
 
     key = "verify"
     layers = (LAYER,)
@@ -46,6 +46,7 @@ class Panel(StepPanel):
         self._cloud: result_views.ScanCloud | None = None
 
     def build(self) -> None:
+        """Create the inputs of capture, results and recorded captures."""
         gui, context, operator = self._gui, self._context, self._operator
         with gui.add_folder("Capture", visible=False) as self._capture_folder:
             self._picture = Picture(gui, "Live image", width_px=SMALL_PX)
@@ -75,15 +76,16 @@ class Panel(StepPanel):
             shapes: tuple[tuple[Shape, Any], ...] = (("plane", viser.Icon.SQUARE), ("sphere", viser.Icon.SPHERE))
             self._all: dict[Shape, viser.GuiButtonHandle] = {}
             for shape, icon in shapes:
-                measure = lambda shape=shape: self._measure([self._recorded.value], shape)  # noqa: E731
+                measure = lambda shape=shape: self._request_verification([self._recorded.value], shape)  # noqa: E731
                 context.button(f"Measure {shape}", measure, icon)
             for shape, icon in shapes:
-                measure_all = lambda shape=shape: self._measure_all(shape)  # noqa: E731
+                measure_all = lambda shape=shape: self._request_all(shape)  # noqa: E731
                 self._all[shape] = context.button(f"Measure all {shape}s", measure_all, icon, visible=False)
         for choice in (self._result, self._model):
             choice.on_change(context.callback(self._refresh))
 
     def draw(self, snapshot: Snapshot) -> None:
+        """Show the verifications of a snapshot."""
         with self._lock:
             self._snapshot = snapshot
             session, ready = snapshot.session, snapshot.step(self.key).state != "blocked"
@@ -112,16 +114,19 @@ class Panel(StepPanel):
             self._refresh()
 
     def draw_preview(self, preview: PreviewView) -> None:
+        """Show the live image."""
         self._picture.set(draw_preview(preview), legend(preview, exposure_html(preview)))
 
     def show(self, visible: bool) -> None:
+        """Show or hide the layers, and move the views to the cloud."""
         super().show(visible)
         self._show_view()
 
     # drawing
 
     def _draw_recorded(self, session: SessionView) -> None:
-        waiting = _not_measured(session)
+        """Offer the recorded captures, those without verification first."""
+        waiting = _list_unverified(session)
         names = {scan.name for scan in waiting}
         change(self._recorded_folder, visible=bool(session.scans))
         self._recorded.offer(
@@ -137,7 +142,7 @@ class Panel(StepPanel):
             change(button, visible=n > 0, label=f"Measure all {n} {shape}s")
 
     def _refresh(self) -> None:
-        """Request the pictures of the chosen result."""
+        """Request the error maps and the cloud of the chosen result."""
         with self._lock:
             session = self._snapshot.session if self._snapshot else None
             name = self._result.value
@@ -160,6 +165,7 @@ class Panel(StepPanel):
             )
 
     def _draw_cloud(self, made: tuple[result_views.ScanCloud, str, Shape]) -> None:
+        """Draw a cloud coloured by the error of a model, with its legend."""
         self._cloud, model, shape = cloud, *_ = made
         limit = error_limit(list(cloud.errors.values()))
         self._scene.cloud(LAYER, "cloud", cloud.points, colours(cloud.errors[model], -limit, limit, "error"))
@@ -169,37 +175,42 @@ class Panel(StepPanel):
         self._show_view()
 
     def _show_view(self) -> None:
+        """Move the browsers' views to the cloud, if it is visible."""
         if self._visible and self._cloud is not None:
             self._context.viewpoints.show(f"{LAYER} {self._cloud.name}", self._cloud.points)
 
     # requests
 
-    def _measure(self, names: Sequence[str], shape: Shape) -> None:
+    def _request_verification(self, names: Sequence[str], shape: Shape) -> None:
+        """Request the verification of captures as a plane or sphere."""
         radius = float(self._radius.value)
         if names and names[0]:
             self._operator.verify(list(names), shape, radius if shape == "sphere" and radius > 0 else None)
 
-    def _measure_all(self, shape: Shape) -> None:
+    def _request_all(self, shape: Shape) -> None:
+        """Request the verification of all captures of a shape that have none yet."""
         session = self._snapshot.session if self._snapshot else None
         if session is not None:
-            self._measure([scan.name for scan in _not_measured(session) if shape_of(scan) == shape], shape)
+            self._request_verification(
+                [scan.name for scan in _list_unverified(session) if shape_of(scan) == shape], shape
+            )
 
 
-def _not_measured(session: SessionView) -> list[ScanView]:
-    """Captures without an up-to-date verification."""
+def _list_unverified(session: SessionView) -> list[ScanView]:
+    """List the captures without an up-to-date verification."""
     measured = {view.capture for view in session.verifications if not view.stale}
     return [scan for scan in session.scans if scan.name not in measured]
 
 
 def shape_of(scan: ScanView) -> str:
-    """ "plane", "sphere" or "scan": the purpose of a capture, or what the name of a recorded one suggests."""
+    """Return "plane", "sphere" or "scan": a capture's purpose, or what the name of a recorded one suggests."""
     if scan.purpose != "scan":
         return scan.purpose
     return next((shape for shape in ("plane", "sphere") if scan.name.lower().startswith(shape)), "scan")
 
 
 def verification_html(view: VerificationView) -> Html:
-    """One capture's figures: each model's RMS beside the noise floor."""
+    """Return a table of one capture's figures: each model's RMS beside the noise floor."""
     sphere = view.shape == "sphere"
     best = min(view.rms_mm, key=lambda model: view.rms_mm[model])
     lines: list[list[object]] = []
@@ -209,10 +220,10 @@ def verification_html(view: VerificationView) -> Html:
             [
                 model,
                 coloured(f"{rms_mm:.3f}", "good" if model == best else "plain", bold=model == best),
-                _format(view.noise_floor_mm[model]),
-                *([_format(view.radius_mm[model])] if sphere else []),
+                _format_value(view.noise_floor_mm[model]),
+                *([_format_value(view.radius_mm[model])] if sphere else []),
                 coloured(f"{100 * outliers:.1f}", "warning" if outliers > MANY_OUTLIERS else "plain"),
-                _format(100 * view.coverage[model], 1),
+                _format_value(100 * view.coverage[model], 1),
             ]
         )
     titles = ["Model", "RMS, mm", "Noise floor, mm", *(["Radius, mm"] if sphere else []), "Outliers, %", "Coverage, %"]
@@ -230,7 +241,7 @@ def verification_html(view: VerificationView) -> Html:
 
 
 def results_table(views: Sequence[VerificationView]) -> str:
-    """Planes, then spheres: one line per capture, one column per model, the best in bold."""
+    """Return tables of planes, then spheres: a line per capture, a column per model, the best in bold."""
     html = ""
     for shape in ("plane", "sphere"):
         of_shape = [view for view in views if view.shape == shape]
@@ -242,10 +253,15 @@ def results_table(views: Sequence[VerificationView]) -> str:
             least = min(view.rms_mm.values())
             title = coloured(view.name + " (stale)" * view.stale, "warning" if view.stale else "plain")
             rms = [view.rms_mm.get(model, np.nan) for model in models]
-            cells = [coloured(_format(mm), "good" if mm == least else "plain", bold=mm == least) for mm in rms]
+            cells = [coloured(_format_value(mm), "good" if mm == least else "plain", bold=mm == least) for mm in rms]
             shares = "/".join(f"{view.incidence.get(r, 0.0):.0f}" for r in ("R1", "R2", "R3"))
             lines.append(
-                [title, shares if view.incidence else "–", *cells, _format(next(iter(view.noise_floor_mm.values())))]
+                [
+                    title,
+                    shares if view.incidence else "–",
+                    *cells,
+                    _format_value(next(iter(view.noise_floor_mm.values()))),
+                ]
             )
         html += table([Html(f"{shape.capitalize()} RMS,&#160;mm"), "R1/R2/R3, %", *models, "Noise floor"], lines)
         if shape == "sphere":
@@ -254,23 +270,25 @@ def results_table(views: Sequence[VerificationView]) -> str:
 
 
 def distances_table(distances: Sequence[SpacingRow]) -> str:
-    """The distances of the spheres' centres by each model."""
+    """Return a table of the distances of the spheres' centres by model; empty without any."""
     measured = {each.name: each.measured_mm for each in distances}
     return _table_by_model("Centre distance, mm", models_of(list(measured.values())), measured) if measured else ""
 
 
 def _table_by_model(title: str, models: Sequence[str], values: Mapping[str, Mapping[str, float]]) -> Html:
-    """A line per name with a value of each model."""
-    rows = [[name, *(_format(each.get(model, np.nan)) for model in models)] for name, each in values.items()]
+    """Return a table with a line per name and a column per model."""
+    rows = [[name, *(_format_value(each.get(model, np.nan)) for model in models)] for name, each in values.items()]
     return table([title, *models], rows)
 
 
 def _maps(maps: Mapping[str, np.ndarray], view: VerificationView) -> Figure:
+    """Plot the error maps of a capture by model."""
     shown = {model: maps[model] for model in view.rms_mm if model in maps}
     floor = list(view.noise_floor_mm.values())[-1]
     title = display_name(view.capture, view.name)
     return error_maps(title, shown, view.rms_mm, floor, width=PLOT_PX, sign=_SIGN[view.shape])
 
 
-def _format(value: float, digits: int = 3) -> str:
+def _format_value(value: float, digits: int = 3) -> str:
+    """Format a value with some digits; a dash where it is not finite."""
     return f"{value:.{digits}f}" if np.isfinite(value) else "–"
