@@ -19,7 +19,7 @@ _MAX_SIZE_PX = 16384
 
 
 class BrowserProjector(Openable):
-    """The page at the other end of `channel`, as a projector of `size` (width, height) px.
+    """A projector of `size` (width, height) px that shows its patterns on the page connected to `channel`.
 
     A capture that loses its page, or during which the page's window changes, ends with a DeviceError; `load` then sends
     the patterns again, to whatever page is ready by then.
@@ -38,7 +38,7 @@ class BrowserProjector(Openable):
         """Show dark. Raises DeviceError with a remedy where the page cannot show patterns pixel by pixel."""
         super().open()
         try:
-            self._forget()
+            self._forget_loaded()
             self._channel.set_pattern_size(self.size)
             self._channel.page()
             self.show_level(None)
@@ -50,7 +50,7 @@ class BrowserProjector(Openable):
         """Release the page, which then shows its marker."""
         if self._open:
             self._channel.set_light(None)
-        self._forget()
+        self._forget_loaded()
         super().close()
 
     def load(self, sequence: PatternSequence) -> None:
@@ -62,7 +62,7 @@ class BrowserProjector(Openable):
         axes: list[str] = [axis or "x" for axis, _ in profiles]
         sent = axes, b"".join(levels.tobytes() for _, levels in profiles)
         if page is not self._page or sent != self._sent:
-            self._forget()
+            self._forget_loaded()
             page.request("load", sent[1], size=self.size, axes=axes)
         self._sequence, self._sent, self._page, self._changes = sequence, sent, page, page.changes
 
@@ -77,7 +77,7 @@ class BrowserProjector(Openable):
             if page.changes != self._changes:
                 raise DeviceError("the projector page's window changed while patterns were shown: capture again")
         except BaseException:
-            self._forget()
+            self._forget_loaded()
             raise
 
     def show_level(self, grey: int | None) -> None:
@@ -88,7 +88,8 @@ class BrowserProjector(Openable):
         self._channel.set_light(level)
         page.request("level", grey=level)
 
-    def _forget(self) -> None:
+    def _forget_loaded(self) -> None:
+        """Forget the loaded sequence and the page that it was sent to."""
         self._sequence = self._sent = self._page = None
 
 

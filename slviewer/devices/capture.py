@@ -21,7 +21,7 @@ def capture(
     out: np.ndarray | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> np.ndarray:
-    """The frames (n, h, w) of `sequence` as the open rig's camera sees them, in `out` if it is given.
+    """Capture the frames (n, h, w) of `sequence` with the open rig, into `out` if it is given.
 
     `progress(done, n)` is called before the first frame and after each, and may raise (Cancelled) to stop. Raises
     DeviceError, with the frame at which it happened; whatever is raised, `out` then holds no capture and the rig can be
@@ -34,7 +34,7 @@ def capture(
 
 
 def _allocate(rig: Rig, n: int, out: np.ndarray | None) -> np.ndarray:
-    """`out`, if `n` frames of the rig's camera fit it, or a new array for them. Raises InputError."""
+    """Return `out` if `n` frames of the rig's camera fit it, or a new array (n, h, w). Raises InputError."""
     width, height = rig.camera.size
     if out is None:
         return np.empty((n, height, width), rig.camera.dtype)
@@ -141,12 +141,12 @@ def _set_exposure(rig: Rig, exposure_ms: float) -> float:
 def _offset_progress(
     progress: Callable[[int, int], None] | None, before: int, frames: int
 ) -> Callable[[int, int], None] | None:
-    """Progress over all `frames`, for one exposure whose frames come after `before` others."""
+    """Return progress over all `frames`, for one exposure whose frames come after `before` others."""
     return None if progress is None else lambda done, _: progress(before + done, frames)
 
 
 def capture_texture(rig: Rig) -> np.ndarray | None:
-    """(h, w, 3) RGB of the scene under white light, where the camera of the open rig sees colour; else None."""
+    """Capture (h, w, 3) RGB of the scene under white light; None where the rig's camera sees no colour."""
     if not isinstance(rig.camera, ColourCamera):
         return None
     rig.projector.show_level(255)

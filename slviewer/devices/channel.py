@@ -36,13 +36,13 @@ class Hello(msgspec.Struct, tag_field="op", tag="hello"):
 
 
 class Report(msgspec.Struct, tag_field="op", tag="screen"):
-    """The page's screen has changed."""
+    """Message of the page that its screen has changed."""
 
     screen: Screen
 
 
 class Done(msgspec.Struct, tag_field="op", tag="done"):
-    """Request `number` was carried out, or why it was not."""
+    """Answer of the page: request `number` was carried out, or why it was not."""
 
     number: int
     why: str = ""
@@ -78,7 +78,7 @@ class PageConnection:
         with self._condition:
             self._number += 1
             self.check()
-            self.send(_encode({"op": op, "number": self._number, **fields}, payload))
+            self.send(_encode_message({"op": op, "number": self._number, **fields}, payload))
             end = time.monotonic() + ANSWER_S
             while self._answer is None or self._answer.number != self._number:
                 self.check()
@@ -114,7 +114,7 @@ class Channel:
     # for panels that show the state
 
     def page_state(self) -> PageState:
-        """The current state of the page."""
+        """Return the current state of the page."""
         with self._condition:
             page = self._page
             if page is None:
@@ -139,13 +139,13 @@ class Channel:
             self._publish_state()
 
     def set_light(self, grey: int | None) -> None:
-        """The light that a page shows after it was reloaded; None: no projector is open, it shows its marker."""
+        """Set the light that a page shows after a reload; None: no projector is open, it shows its marker."""
         with self._condition:
             self._light = grey
             self._publish_state()
 
     def page(self) -> PageConnection:
-        """The connected page, able to show the patterns. Raises DeviceError with a remedy."""
+        """Return the connected page, able to show the patterns. Raises DeviceError with a remedy."""
         with self._condition:
             if self._page is None:
                 raise DeviceError(_NO_PAGE)
@@ -158,13 +158,13 @@ class Channel:
         """Connect the page that sent `hello`; None where another window is the projector. Raises InputError for an
         invalid message.
         """
-        incoming: Hello = _decode(hello, Hello)
+        incoming: Hello = _decode_message(hello, Hello)
         with self._condition:
             before = self._page
             if before is not None:
                 if incoming.window != before.window and not incoming.take:
                     return None
-                self._end(
+                self._end_connection(
                     before,
                     "the projector page was reloaded, or connected anew"
                     if incoming.window == before.window
@@ -177,7 +177,7 @@ class Channel:
 
     def handle_message(self, page: PageConnection, message: str | bytes) -> None:
         """Handle a message of a connected page. Raises InputError for an invalid one."""
-        incoming = _decode(message, Report | Done)
+        incoming = _decode_message(message, Report | Done)
         with self._condition:
             if isinstance(incoming, Done):
                 page.store_answer(incoming)
@@ -192,9 +192,10 @@ class Channel:
         with self._condition:
             if self._page is page:
                 self._page = None
-                self._end(page, "the projector page was closed, or its connection was lost")
+                self._end_connection(page, "the projector page was closed, or its connection was lost")
 
-    def _end(self, page: PageConnection, why: str) -> None:
+    def _end_connection(self, page: PageConnection, why: str) -> None:
+        """End a connection: requests to this page then raise DeviceError with the reason."""
         page.gone = f"{why}: capture again once it is ready"
         self._condition.notify_all()
 
@@ -210,16 +211,17 @@ class Channel:
         if state != page.published:
             page.published = state
             fields = {"refused": page.refused, "full": page.screen.full_screen, "size": size, "light": self._light}
-            page.send(_encode({"op": "stand", **fields}))
+            page.send(_encode_message({"op": "stand", **fields}))
 
 
-def _encode(header: dict[str, Any], payload: bytes = b"") -> bytes:
-    """The length of the header as 4 bytes, little endian, then the header as JSON, then the payload."""
+def _encode_message(header: dict[str, Any], payload: bytes = b"") -> bytes:
+    """Encode a message: the header's length as 4 bytes, little endian, the header as JSON, then the payload."""
     text = msgspec.json.encode(header)
     return struct.pack("<I", len(text)) + text + payload
 
 
-def _decode(message: str | bytes, kind: Any) -> Any:
+def _decode_message(message: str | bytes, kind: Any) -> Any:
+    """Decode a JSON message of the page as `kind`. Raises InputError for an invalid one."""
     try:
         return msgspec.json.decode(message, type=kind)
     except (msgspec.MsgspecError, UnicodeError) as error:

@@ -14,7 +14,7 @@ from slviewer.errors import DeviceError, InputError
 
 @dataclass(frozen=True)
 class Driver:
-    """One way to reach devices; its factories take what that driver needs, and import vendor packages when called.
+    """A driver of devices; its factories take the driver's options, and import vendor packages when called.
 
     `what`: in a few words, what it drives. `packages`: how to install each package that must be importable, such as
     ``{"harvesters": "pip install 'slviewer[genicam]'"}``. A driver offers cameras, projectors, whole rigs (where both
@@ -44,19 +44,19 @@ class Driver:
 
 @cache
 def drivers() -> dict[str, Driver]:
-    """All drivers by name, usable here or not."""
+    """Return all drivers by name, usable here or not."""
     modules = (module.name for module in pkgutil.iter_modules(slviewer.devices.__path__))
     candidates = (getattr(importlib.import_module(f"slviewer.devices.{name}"), "DRIVER", None) for name in modules)
     return {driver.name: driver for driver in candidates if isinstance(driver, Driver)}
 
 
 def available() -> list[Driver]:
-    """All drivers, those that can be used here first; `needs` and `missing` name what the others require."""
+    """List all drivers, those that can be used here first; `needs` and `missing` name what the others require."""
     return sorted(drivers().values(), key=lambda driver: (bool(driver.missing), driver.name))
 
 
 def driver(name: str) -> Driver:
-    """The driver called `name`. Raises InputError if there is none, DeviceError if it lacks a package."""
+    """Return the driver called `name`. Raises InputError if there is none, DeviceError if it lacks a package."""
     if name not in drivers():
         raise InputError(f"no driver is called {name!r}: use one of {', '.join(sorted(drivers()))}")
     selected = drivers()[name]

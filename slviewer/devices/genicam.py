@@ -26,7 +26,7 @@ class GenicamCamera(Openable):
     """A camera that delivers grey levels unprocessed: uint8, or uint16 with its 10 or 12 bits at the bottom.
 
     With a software trigger each grab starts its own exposure. Of a camera that runs free, or by a line whose pulses
-    repeat (a projector's frame clock), buffers are thrown away until one comes whose exposure began after the call. A
+    repeat (a projector's frame clock), buffers are discarded until one comes whose exposure began after the call. A
     frame that is late or incomplete is a DeviceError, and never mistaken for the next: the stream is restarted after
     it.
     """
@@ -51,7 +51,7 @@ class GenicamCamera(Openable):
         super().open()
         try:
             self._link = Link(self._camera)
-            features = self._features()
+            features = self._get_features()
             features.prepare(self.pixels, self._trigger, self._line)
             if features.size() != self.size:
                 (width, height), (columns, rows) = features.size(), self.size
@@ -75,21 +75,21 @@ class GenicamCamera(Openable):
             link.close()
 
     def grab(self, out: np.ndarray) -> None:
-        """A frame whose exposure began after the call."""
+        """Grab a frame whose exposure began after the call into `out` (h, w)."""
         self.check_open()
         check_frame(self, out)
         with self._grab_fresh() as image:
             self.pixels.unpack(image.data, out, image.padding)
 
     def settings(self) -> CameraSettings:
-        """The current settings; None for those that the camera lacks, and for a gain in device-specific steps."""
+        """Read the current settings; None for those that the camera lacks, and for a gain in device-specific steps."""
         self.check_open()
-        return self._features().settings()
+        return self._get_features().settings()
 
     def apply(self, settings: CameraSettings) -> CameraSettings:
         """Set the nearest supported values, and return them; None for settings that the camera lacks."""
         self.check_open()
-        features = self._features()
+        features = self._get_features()
         features.apply(settings)
         applied = features.settings()
         self._timeout_s = _ANSWER_TIMEOUT_S + (applied.exposure_ms or 0.0) / 1000
@@ -97,6 +97,7 @@ class GenicamCamera(Openable):
 
     @contextlib.contextmanager
     def _grab_fresh(self) -> Iterator[Image]:
+        """Yield an image whose exposure began after the call; after an error the stream is stopped."""
         link = self._link
         assert link is not None
         try:
@@ -104,7 +105,7 @@ class GenicamCamera(Openable):
                 link.start()
             link.drop_filled()
             if self._trigger == "software":
-                self._features().fire()
+                self._get_features().fire()
             else:
                 for _ in range(IN_FLIGHT):
                     link.drop_next(self._timeout_s)
@@ -116,7 +117,8 @@ class GenicamCamera(Openable):
             link.stop()  # what is still on its way must not be the next grab's
             raise
 
-    def _features(self) -> Features:
+    def _get_features(self) -> Features:
+        """Return the features of the open camera."""
         assert self._link is not None
         return Features(self._link.node_map, self.name)
 
@@ -129,19 +131,20 @@ class GenicamColourCamera(GenicamCamera):
         self.channel = channel
 
     def grab(self, out: np.ndarray) -> None:
-        """The channel of a frame whose exposure began after the call."""
+        """Grab one channel of a frame whose exposure began after the call into `out` (h, w)."""
         self.check_open()
         check_frame(self, out)
         with self._grab_fresh() as image:
-            extract_channel(self._rgb(image), self.channel, out)
+            extract_channel(self._convert_rgb(image), self.channel, out)
 
     def grab_colour(self) -> np.ndarray:
-        """The whole of such a frame, (h, w, 3) RGB."""
+        """Grab a frame whose exposure began after the call, (h, w, 3) RGB."""
         self.check_open()
         with self._grab_fresh() as image:
-            return np.array(self._rgb(image))
+            return np.array(self._convert_rgb(image))
 
-    def _rgb(self, image: Image) -> np.ndarray:
+    def _convert_rgb(self, image: Image) -> np.ndarray:
+        """Convert the bytes of an image to (h, w, 3) RGB."""
         return self.pixels.rgb(self.pixels.view_samples(image.data, image.size, image.padding))
 
 
@@ -156,7 +159,7 @@ def genicam_camera(
     trigger: Trigger | None = None,
     line: str | None = None,
 ) -> Camera:
-    """The connected camera of that serial number or model, or the only one there is; not opened yet.
+    """Return the connected camera of that serial number or model, or the only one there is; not opened yet.
 
     `producer` is the .cti file of its maker's software, None: all that are installed. `exposure_ms` and `gain` are set
     when it is opened, None: unchanged. `pixel_format` None: the deepest mono of up to 12 bits that comes
@@ -177,6 +180,7 @@ def genicam_camera(
 
 
 def _choose_camera(cameras: list[ListedCamera], serial: str | None, model: str | None) -> ListedCamera:
+    """Return the only camera of that serial number and model. Raises InputError or DeviceError with a list."""
     listed = "; ".join(map(str, cameras))
     matching = [
         camera
@@ -193,7 +197,7 @@ def _choose_camera(cameras: list[ListedCamera], serial: str | None, model: str |
 
 
 def list_connected() -> list[str]:
-    """One line for each camera that is connected: maker, model, serial number. Raises DeviceError without producers."""
+    """List the connected cameras: maker, model, serial number. Raises DeviceError without producers."""
     return [str(camera) for camera in list_cameras()]
 
 

@@ -28,14 +28,14 @@ _FRAME_TRIGGERS = ("FrameStart", "ExposureStart")
 
 
 class Features:
-    """The features of one camera, called `name` in messages. Every method raises DeviceError if it does not answer."""
+    """The GenICam features of a camera called `name`. Every method raises DeviceError if it does not answer."""
 
     def __init__(self, node_map: Any, name: str) -> None:
         self._nodes, self._name = node_map, name
 
     def size(self) -> tuple[int, int]:
-        """(width, height) px of its images: the whole sensor, or the region that is set in it."""
-        width, height = self._readable("Width"), self._readable("Height")
+        """Return the (width, height) px of its images: the whole sensor, or the region that is set in it."""
+        width, height = self._get_readable("Width"), self._get_readable("Height")
         if width is None or height is None:
             raise DeviceError(f"{self._name} does not report its image size: use another camera")
         with as_device_error(self._name):
@@ -45,7 +45,7 @@ class Features:
         """Choose the pixel format, `wanted` or the best. Raises InputError for one that is not offered or not
         supported.
         """
-        offered = self._choices("PixelFormat")
+        offered = self._list_choices("PixelFormat")
         usable = [name for name in offered if pixel_format(name) is not None]
         chosen = best_format(usable) if wanted is None else pixel_format(wanted) if wanted in offered else None
         if chosen is None:
@@ -62,9 +62,9 @@ class Features:
         """
         if wanted is not None and wanted not in get_args(Trigger):
             raise InputError(f"no trigger is called {wanted!r}: use one of {', '.join(get_args(Trigger))}")
-        has_mode = "On" in self._choices("TriggerMode")
-        sources = self._choices("TriggerSource") if has_mode else []
-        software = "Software" in sources and self._has("TriggerSoftware")
+        has_mode = "On" in self._list_choices("TriggerMode")
+        sources = self._list_choices("TriggerSource") if has_mode else []
+        software = "Software" in sources and self._has_node("TriggerSoftware")
         if wanted is None:
             return "software" if software else "free"
         if wanted == "software" and not software:
@@ -81,10 +81,10 @@ class Features:
 
     def check_settings(self, wanted: CameraSettings) -> None:
         """Raise InputError for settings that the camera has no feature for."""
-        if wanted.exposure_ms is not None and self._exposure() is None:
+        if wanted.exposure_ms is not None and self._get_exposure_node() is None:
             raise InputError(f"{self._name} has no exposure time that can be set: leave exposure_ms out")
-        if wanted.gain is not None and self._gain() is None:
-            gain = self._readable("Gain")
+        if wanted.gain is not None and self._get_gain_node() is None:
+            gain = self._get_readable("Gain")
             why = "no gain" if gain is None else "a gain in device-specific steps of unknown factor"
             raise InputError(f"{self._name} has {why}: leave `gain` out, and set it with its maker's software")
 
@@ -97,15 +97,15 @@ class Features:
             for name in _AUTOMATIC:
                 self._choose(name, "Off")
             for name in _ALTERING:
-                node = self._writable(name)
+                node = self._get_writable(name)
                 if node is not None:
                     node.value = False
-            gamma = self._writable("Gamma")
+            gamma = self._get_writable("Gamma")
             if gamma is not None:
                 _set_nearest(gamma, 1.0)
             self._choose("GainSelector", "All")
             self._set_trigger(trigger, line)
-            current = self._readable("PixelFormat")
+            current = self._get_readable("PixelFormat")
             if current is None or current.value != chosen.name:
                 raise DeviceError(f"{self._name} did not accept the pixel format {chosen.name}: choose another one")
 
@@ -120,9 +120,9 @@ class Features:
             self._nodes.TriggerSoftware.execute()
 
     def settings(self) -> CameraSettings:
-        """The current settings; None for those that the camera lacks, and for a gain of unknown factor."""
+        """Read the current settings; None for those that the camera lacks, and for a gain of unknown factor."""
         with as_device_error(self._name):
-            exposure, gain = self._exposure(), self._gain()
+            exposure, gain = self._get_exposure_node(), self._get_gain_node()
             return CameraSettings(
                 None if exposure is None else float(exposure.value) * _ms_per_unit(exposure),
                 None if gain is None else 10 ** (float(gain.value) / 20),
@@ -131,22 +131,24 @@ class Features:
     def apply(self, settings: CameraSettings) -> None:
         """Set the nearest supported values of the settings that the camera has."""
         with as_device_error(self._name):
-            exposure, gain = self._exposure(), self._gain()
+            exposure, gain = self._get_exposure_node(), self._get_gain_node()
             if settings.exposure_ms is not None and _is_settable(exposure):
                 _set_nearest(exposure, settings.exposure_ms / _ms_per_unit(exposure))
             if settings.gain is not None and _is_settable(gain):
                 _set_nearest(gain, 20 * math.log10(settings.gain))
 
-    def _exposure(self) -> Any:
-        return next((node for name in _EXPOSURES if (node := self._readable(name)) is not None), None)
+    def _get_exposure_node(self) -> Any:
+        """Return the readable node of the exposure time; None where there is none."""
+        return next((node for name in _EXPOSURES if (node := self._get_readable(name)) is not None), None)
 
-    def _gain(self) -> Any:
-        gain = self._readable("Gain")
+    def _get_gain_node(self) -> Any:
+        """Return the readable node of the gain, if its unit is dB; else None."""
+        gain = self._get_readable("Gain")
         return gain if gain is not None and str(getattr(gain, "unit", "")).strip().lower() == "db" else None
 
     def _set_trigger(self, trigger: Trigger, line: str | None) -> None:
         """Switch every trigger off but the one that starts each frame."""
-        selectors = self._choices("TriggerSelector")
+        selectors = self._list_choices("TriggerSelector")
         for selector in selectors or [""]:
             self._choose("TriggerSelector", selector)
             self._choose("TriggerMode", "Off")
@@ -159,9 +161,9 @@ class Features:
         if not (self._choose("TriggerSource", source or "") and self._choose("TriggerMode", "On")):
             raise DeviceError(f"{self._name} did not accept the trigger {source}: choose another one")
 
-    def _choices(self, name: str) -> list[str]:
-        """The currently readable entries of the enumeration `name`."""
-        node = self._readable(name)
+    def _list_choices(self, name: str) -> list[str]:
+        """List the readable entries of the enumeration `name`."""
+        node = self._get_readable(name)
         if node is None:
             return []
         with as_device_error(self._name):
@@ -169,36 +171,39 @@ class Features:
 
     def _choose(self, name: str, choice: str) -> bool:
         """Set the enumeration `name` to `choice`; False where the camera does not offer it."""
-        if choice not in self._choices(name):
+        if choice not in self._list_choices(name):
             return False
         node = getattr(self._nodes, name)
         if node.value != choice:
             node.value = choice
         return True
 
-    def _readable(self, name: str) -> Any:
-        return self._node(name, _READABLE)
+    def _get_readable(self, name: str) -> Any:
+        """Return the node `name` if it can be read now; else None."""
+        return self._get_node(name, _READABLE)
 
-    def _writable(self, name: str) -> Any:
-        return self._node(name, _WRITABLE)
+    def _get_writable(self, name: str) -> Any:
+        """Return the node `name` if it can be written now; else None."""
+        return self._get_node(name, _WRITABLE)
 
-    def _node(self, name: str, access: tuple[int, ...]) -> Any:
-        """The node `name`, if it has one of these access modes now; else None."""
+    def _get_node(self, name: str, access: tuple[int, ...]) -> Any:
+        """Return the node `name`, if it has one of these access modes now; else None."""
         with as_device_error(self._name):
             node = getattr(self._nodes, name, None)
             return node if node is not None and node.get_access_mode() in access else None
 
-    def _has(self, name: str) -> bool:
+    def _has_node(self, name: str) -> bool:
         """Whether the camera implements a node, even if it is not accessible now."""
-        return self._node(name, _IMPLEMENTED) is not None
+        return self._get_node(name, _IMPLEMENTED) is not None
 
 
 def _is_settable(node: Any) -> bool:
+    """Whether a node exists and can be written now."""
     return node is not None and node.get_access_mode() in _WRITABLE
 
 
 def _ms_per_unit(exposure: Any) -> float:
-    """Length of the exposure node's unit in ms; microseconds, as in the standard, where it names none."""
+    """Return the length of the exposure node's unit in ms; microseconds, as in the standard, where it names none."""
     return _MS.get(str(getattr(exposure, "unit", "")).strip(), 1e-3)
 
 

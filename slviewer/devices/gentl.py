@@ -43,10 +43,10 @@ class ListedCamera:
 
 @contextlib.contextmanager
 def as_device_error(name: str) -> Iterator[None]:
-    """Convert exceptions of the GenICam libraries into a DeviceError about `name`."""
+    """Convert exceptions of the GenICam libraries, raised in the block, to a DeviceError about `name`."""
     try:
         yield
-    except _library_errors() as error:
+    except _list_library_errors() as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise DeviceError(
             f"{name} does not answer: check its cable, and close other programs that use it ({reason})"
@@ -54,7 +54,7 @@ def as_device_error(name: str) -> Iterator[None]:
 
 
 def producer_files(producer: str | None = None) -> list[str]:
-    """The .cti files to load: the one that is given, or all that are installed.
+    """List the .cti files to load: the given one, or all that are installed.
 
     Raises InputError where the given one is no such file, DeviceError where none is installed.
     """
@@ -74,7 +74,7 @@ def producer_files(producer: str | None = None) -> list[str]:
 
 
 def list_cameras(producer: str | None = None) -> list[ListedCamera]:
-    """All cameras that the producers list; one that cannot be loaded fails only where it is the only one.
+    """List the cameras of all producers; one that cannot be loaded is an error only if it is the only one.
 
     While a camera of a producer is claimed in this process, its list is that of when it was claimed: to look again
     would take the camera away.
@@ -93,16 +93,18 @@ def list_cameras(producer: str | None = None) -> list[ListedCamera]:
 
 @dataclass
 class _Producer:
+    """A loaded producer's harvester, and the number of its users."""
+
     harvester: Any
     users: int = 0
 
 
 @contextlib.contextmanager
 def open_producer(file: str) -> Iterator[Any]:
-    """The harvester of one producer, shared: it updates its list for the first user, and is closed after the last."""
+    """Yield the shared harvester of a producer, updated for its first user and closed after its last."""
     with LOCK:
         if file not in _PRODUCERS:
-            _PRODUCERS[file] = _Producer(_load(file))
+            _PRODUCERS[file] = _Producer(_load_producer(file))
         producer = _PRODUCERS[file]
         producer.users += 1
     try:
@@ -115,7 +117,8 @@ def open_producer(file: str) -> Iterator[Any]:
                 ignore_errors(producer.harvester.reset)
 
 
-def _load(file: str) -> Any:
+def _load_producer(file: str) -> Any:
+    """Load a producer and list its cameras; returns its harvester. Raises DeviceError."""
     from harvesters.core import Harvester, ParameterKey, ParameterSet
 
     harvester = Harvester(config=ParameterSet({ParameterKey.LOGGER: _LOG}))
@@ -126,37 +129,39 @@ def _load(file: str) -> Any:
             raise DeviceError(f"the GenTL producer {file} cannot list cameras: close other programs that use them")
     except BaseException as error:
         ignore_errors(harvester.reset)
-        if isinstance(error, (OSError, *_library_errors())):
+        if isinstance(error, (OSError, *_list_library_errors())):
             raise DeviceError(f"the GenTL producer {file} cannot be loaded: install it again ({error})") from error
         raise
     return harvester
 
 
 def read_listed_camera(info: Any, file: str) -> ListedCamera:
-    """Convert a producer's device info of one camera."""
+    """Convert a producer's device info to a `ListedCamera`."""
 
     def word(what: str) -> str:
+        """Return a property as text; "?" where it is empty."""
         return str(read_info(info, what) or "").strip() or "?"
 
     return ListedCamera(word("vendor"), word("model"), word("serial_number"), file, word("id_"))
 
 
 def read_info(module: Any, what: str) -> Any:
-    """The property `what` of a GenTL module, None where its producer does not report it."""
+    """Return the property `what` of a GenTL module; None where its producer does not report it."""
     try:
         return getattr(module, what)
-    except _library_errors():
+    except _list_library_errors():
         return None
 
 
-def _library_errors() -> tuple[type[Exception], ...]:
+def _list_library_errors() -> tuple[type[Exception], ...]:
+    """Return the exception types of the GenICam libraries."""
     from genicam import genapi, gentl
 
     return (genapi.GenericException, gentl.GenericException)
 
 
 def ignore_errors(step: Callable[[], object]) -> None:
-    """Run one step of closing; log what it raises."""
+    """Call a step of closing, and log what it raises."""
     try:
         step()
     except Exception as error:

@@ -39,7 +39,7 @@ class Image:
 
 @contextlib.contextmanager
 def open_node_map(camera: ListedCamera) -> Iterator[Any]:
-    """The node map of `camera`, for reading; claims the camera meanwhile unless this process has claimed it already."""
+    """Yield the node map of `camera`, for reading; claims the camera meanwhile unless this process has already."""
     with LOCK:
         link = _LINKS.get(camera)
     if link is not None:
@@ -53,7 +53,7 @@ def open_node_map(camera: ListedCamera) -> Iterator[Any]:
 
 
 class Link:
-    """One claimed camera. Belongs to one thread; `close` never raises, and the camera can be claimed again after it."""
+    """A claimed camera. Belongs to one thread; `close` never raises, and the camera can be claimed again after it."""
 
     def __init__(self, camera: ListedCamera) -> None:
         """Claim the camera. Raises DeviceError where it is not connected or in use by another program."""
@@ -73,7 +73,7 @@ class Link:
                 if not listed:
                     raise DeviceError(f"{self.name} is not connected: plug it in, and wait until it has started")
                 with as_device_error(self.name), _preserve_sigint_handler():
-                    self._acquirer = self._harvester.create(listed[0], config=_acquirer_options())
+                    self._acquirer = self._harvester.create(listed[0], config=_make_acquirer_options())
                 if len(self._acquirer.data_streams) != 1:
                     raise DeviceError(f"{self.name} sends {len(self._acquirer.data_streams)} streams: use one with one")
                 self._acquirer.timeout_period_on_update_event_data_call = 0
@@ -117,32 +117,32 @@ class Link:
                 before = self._incomplete.count
                 buffer = self._acquirer.try_fetch(timeout=_POLL_S / 5, is_raw=True)
                 if buffer is not None:
-                    _hand_back(buffer)
+                    _return_buffer(buffer)
                 elif self._incomplete.count == before:
                     return
 
     def drop_next(self, timeout_s: float) -> None:
         """Return the next buffer, complete or not, unread."""
-        buffer = self._wait(timeout_s)
+        buffer = self._wait_buffer(timeout_s)
         if buffer is not None:
             with as_device_error(self.name):
-                _hand_back(buffer)
+                _return_buffer(buffer)
 
     @contextlib.contextmanager
     def next(self, timeout_s: float, nbytes: Callable[[tuple[int, int], int], int]) -> Iterator[Image]:
-        """The next image; `nbytes(size, padding)`: the bytes required. Raises DeviceError for an incomplete one."""
-        buffer = self._wait(timeout_s)
+        """Yield the next image; `nbytes(size, padding)`: bytes required. Raises DeviceError for an incomplete one."""
+        buffer = self._wait_buffer(timeout_s)
         if buffer is None:
             raise DeviceError(_describe_incomplete_frame(self.name))
         try:
             with as_device_error(self.name):
-                image = self._image(buffer, nbytes)
+                image = self._read_image(buffer, nbytes)
             yield image
         finally:
-            ignore_errors(lambda: _hand_back(buffer))
+            ignore_errors(lambda: _return_buffer(buffer))
 
-    def _wait(self, timeout_s: float) -> Any:
-        """The next buffer, None for one that is incomplete.
+    def _wait_buffer(self, timeout_s: float) -> Any:
+        """Wait for the next buffer; None for one that is incomplete.
 
         Polled, with pauses of our own: the binding keeps all Python threads waiting while it waits, and
         `fetch` restarts its timeout after each incomplete buffer, and returns none of them.
@@ -160,7 +160,7 @@ class Link:
                 )
             time.sleep(_POLL_S)
 
-    def _image(self, buffer: Any, nbytes: Callable[[tuple[int, int], int], int]) -> Image:
+    def _read_image(self, buffer: Any, nbytes: Callable[[tuple[int, int], int], int]) -> Image:
         """Read from the raw buffer: harvesters' own components unpack into copies, and keep the rows' padding."""
         nodes = self.node_map
         size = (read_info(buffer, "width") or nodes.Width.value, read_info(buffer, "height") or nodes.Height.value)
@@ -176,19 +176,23 @@ class Link:
 
 
 def _make_event_counter() -> Any:
-    """A callback that counts."""
+    """Return a callback that counts its calls."""
     from harvesters.core import Callback
 
     class Counter(Callback):
+        """Callback for events that counts them."""
+
         count = 0
 
         def emit(self, context: object = None) -> None:
+            """Count an event."""
             self.count += 1
 
     return Counter()
 
 
-def _acquirer_options() -> Any:
+def _make_acquirer_options() -> Any:
+    """Return the options of harvesters' acquirers: chunk data is not parsed."""
     from harvesters.core import ParameterKey, ParameterSet
 
     # Unused chunks are not parsed: the chunks of a damaged buffer cannot be, which costs the buffer.
@@ -206,11 +210,13 @@ def _preserve_sigint_handler() -> Iterator[None]:
             signal.signal(signal.SIGINT, before)
 
 
-def _hand_back(buffer: Any) -> None:
+def _return_buffer(buffer: Any) -> None:
+    """Queue a buffer again, to be filled."""
     buffer.parent.queue_buffer(buffer)
 
 
 def _describe_incomplete_frame(name: str) -> str:
+    """Return the message for an incomplete frame, with remedies."""
     return (
         f"{name} sent an incomplete frame: use a faster port or a shorter cable, and for GigE cameras jumbo packets or "
         "a longer packet delay"

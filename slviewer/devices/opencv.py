@@ -129,7 +129,7 @@ class OpenCVCamera(Openable):
         return cv2.cvtColor(image, cv2.COLOR_GRAY2RGB if image.ndim == 2 else cv2.COLOR_BGR2RGB)
 
     def settings(self) -> CameraSettings:
-        """The exposure, None where the camera does not report it."""
+        """Read the exposure; None where the camera does not report it."""
         dialect = self._dialect
         reader = self._require_reader()
         return CameraSettings(None if dialect is None else reader.do(lambda capture: exposure_ms(capture, dialect)))
@@ -146,6 +146,7 @@ class OpenCVCamera(Openable):
         return self.settings()
 
     def _require_reader(self) -> Reader:
+        """Return the reader. Raises DeviceError unless the camera is open."""
         self.check_open()
         assert self._reader is not None
         return self._reader
@@ -171,7 +172,7 @@ class OpenCVCamera(Openable):
         self._unsettled = SETTLING
 
     def _read_picture(self) -> np.ndarray:
-        """The next valid picture, (h, w, 3) BGR or (h, w)."""
+        """Read the next valid picture, (h, w, 3) BGR or (h, w)."""
         reader = self._require_reader()
         if reader.live:
             image = reader.picture(later=self._unsettled)
@@ -188,6 +189,7 @@ class OpenCVCamera(Openable):
         return self._check_size(following)
 
     def _check_size(self, image: np.ndarray) -> np.ndarray:
+        """Return the image if it has the camera's size and 8 bits. Raises DeviceError otherwise."""
         height, width = image.shape[:2]
         if (width, height) != self.size:
             raise DeviceError(
@@ -199,7 +201,7 @@ class OpenCVCamera(Openable):
         return image
 
     def _probe_size(self) -> tuple[int, int]:
-        """The source's default size (width, height) px."""
+        """Return the source's default size (width, height) px."""
         reader = Reader(self.name, self._connect)
         try:
             height, width = reader.first().shape[:2]

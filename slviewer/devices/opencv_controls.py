@@ -1,6 +1,6 @@
 """What OpenCV's ways to a webcam call its exposure, gain, focus and white balance, and in which units.
 
-A camera may refuse a value, round it or ignore it: what counts is what it says when it is asked afterwards.
+A camera may refuse a value, round it or ignore it: what counts is the value that it reports afterwards.
 """
 
 import math
@@ -42,19 +42,20 @@ _V4L2 = Dialect(
 
 # Windows counts in powers of two of a second (learn.microsoft.com, "ICameraControl::put_Exposure"); OpenCV cuts the
 # fraction off, and sets each value with the flag that says "manual" (cap_dshow.cpp, cap_msmf.cpp: setProperty).
-def _windows(white_balance: int) -> Dialect:
+def _make_windows_dialect(white_balance: int) -> Dialect:
+    """Return the conventions of Windows' backends: exposures are powers of two in s, set by their exponent."""
     return Dialect(lambda value: 1000 * 2.0**value, lambda ms: float(round(math.log2(ms / 1000))), white_balance)
 
 
 _DIALECTS = {
     "V4L2": _V4L2,
-    "DSHOW": _windows(cv2.CAP_PROP_WHITE_BALANCE_BLUE_U),
-    "MSMF": _windows(cv2.CAP_PROP_TEMPERATURE),
+    "DSHOW": _make_windows_dialect(cv2.CAP_PROP_WHITE_BALANCE_BLUE_U),
+    "MSMF": _make_windows_dialect(cv2.CAP_PROP_TEMPERATURE),
 }
 
 
 def dialect_of(capture: cv2.VideoCapture) -> Dialect | None:
-    """The control conventions of the open `capture`'s backend; None where controls are not accessible: those of a
+    """Return the control conventions of the open `capture`'s backend; None where controls are not accessible.
     stream, and on macOS those of any camera (cap_avfoundation_mac.mm sets a size and a frame rate only).
     """
     dialect = _DIALECTS.get(capture.getBackendName())
@@ -91,7 +92,7 @@ def disable_automatics(capture: cv2.VideoCapture, words: Dialect) -> dict[str, s
 
 
 def exposure_ms(capture: cv2.VideoCapture, words: Dialect) -> float | None:
-    """The current exposure, ms; None where the camera does not report it."""
+    """Read the current exposure, ms; None where the camera does not report it."""
     value = capture.get(cv2.CAP_PROP_EXPOSURE)
     ms = 0.0 if value == UNKNOWN else words.to_ms(value)
     return ms if 0 < ms < 1e5 else None

@@ -1,8 +1,8 @@
 """One video capture on a thread of its own, which alone knows which of its pictures are new.
 
-Calls into a capture may block for as long as a driver or a network likes, so that whoever needs a picture waits here,
-and not longer than `PATIENCE_S`. A live source is read without a break, wanted or not: unread pictures pile up in
-the buffers of the driver, of the network and of the sender, and comes out later as if it were new.
+Calls into a capture may block for as long as a driver or a network likes, so that callers who need a picture wait here,
+and not longer than `PATIENCE_S`. A live source is read without a break, wanted or not: unread pictures accumulate in
+the buffers of the driver, of the network and of the sender, and arrive later as if they were new.
 """
 
 import threading
@@ -56,8 +56,8 @@ class Pace:
     def add(self, now: float, busy: float) -> float | None:
         """Add a picture that arrived at `now` s, when the reader had computed for `busy` s in all.
 
-        Returns the time since the previous one in mean frame periods; None before three have arrived. The mean is taken
-        over seconds, so that pictures which come in clumps, or in a flood after a pause, do not shorten it.
+        Returns the time since the previous one in mean frame periods; None before three have arrived. The mean is over
+        seconds, so that pictures which come in clumps, or in a flood after a pause, do not shorten it.
         """
         arrivals = self._arrivals
         periods = None
@@ -77,7 +77,7 @@ class Pace:
 
 
 class _Job:
-    """Something to do with the capture between two pictures."""
+    """A function to run on the capture between two pictures, with its result."""
 
     def __init__(self, work: Callable[[cv2.VideoCapture], Any]) -> None:
         self._work = work
@@ -86,6 +86,7 @@ class _Job:
         self._error: Exception | None = None
 
     def run(self, capture: cv2.VideoCapture) -> None:
+        """Run the work on the capture, and store its result or error."""
         try:
             self._result = self._work(capture)
         except Exception as error:
@@ -93,6 +94,7 @@ class _Job:
         self.done = True
 
     def result(self) -> Any:
+        """Return the result of the work, or raise its error."""
         if self._error is not None:
             raise self._error
         return self._result
@@ -133,9 +135,9 @@ class Reader:
         return self._live
 
     def first(self) -> np.ndarray:
-        """The first good picture, (h, w, 3) BGR or (h, w), as soon as the source is open. Raises DeviceError."""
+        """Wait for the first valid picture, (h, w, 3) BGR or (h, w), once the source is open. Raises DeviceError."""
         with self._condition:
-            self._wait(lambda: self._first is not None, OPENING_S)
+            self._wait_until(lambda: self._first is not None, OPENING_S)
             assert self._first is not None
             return self._first
 
@@ -145,20 +147,20 @@ class Reader:
         with self._condition:
             self._jobs.append(job)
             self._condition.notify_all()
-            self._wait(lambda: job.done, PATIENCE_S)
+            self._wait_until(lambda: job.done, PATIENCE_S)
         return job.result()
 
     def picture(self, later: int = 0) -> np.ndarray:
-        """A live source's first picture exposed after this call, or the one `later` pictures after that.
+        """Wait for a live source's first picture exposed after this call, or the one `later` pictures after that.
 
-        The delay within an encoder and a network cannot be seen from here: it is the rig's to measure and to wait for.
+        The delay within an encoder and a network cannot be measured here: the rig measures it and waits for it.
         """
         wanted = _Wanted(FRAMES + later)
         with self._condition:
             self._wanted = wanted
             try:
                 # some sources may be slow and others may come in clumps: the end is when nothing counts for too long
-                self._wait(lambda: wanted.image is not None, PATIENCE_S, PATIENCE_S * wanted.remaining)
+                self._wait_until(lambda: wanted.image is not None, PATIENCE_S, PATIENCE_S * wanted.remaining)
             finally:
                 self._wanted = None
         assert wanted.image is not None
@@ -175,7 +177,7 @@ class Reader:
         """Wait until the capture is released."""
         self._thread.join(timeout_s)
 
-    def _wait(self, ready: Callable[[], bool], patience_s: float, longest_s: float = 0.0) -> None:
+    def _wait_until(self, ready: Callable[[], bool], patience_s: float, longest_s: float = 0.0) -> None:
         """Wait for `ready()` on the condition. Raises DeviceError once no picture has come for `patience_s`."""
         requested_s = time.monotonic()
         while not ready():
@@ -198,6 +200,7 @@ class Reader:
     # on its own thread
 
     def _serve(self) -> None:
+        """Open the source, run jobs and read pictures until closing; store why the source was lost."""
         capture = None
         try:
             connected = self._connect()
@@ -215,7 +218,7 @@ class Reader:
                     with self._condition:
                         self._condition.notify_all()
                 if connected.live and not self._closing:
-                    self._read(connected)
+                    self._read_next(connected)
         except DeviceError as error:
             self._report_loss(str(error))
         except Exception as error:
@@ -246,7 +249,7 @@ class Reader:
             self._first, self._live, self._arrived = image, connected.live, time.monotonic()
             self._condition.notify_all()
 
-    def _read(self, connected: Connected) -> None:
+    def _read_next(self, connected: Connected) -> None:
         """Read the next picture of a live source, decoded only if it is the requested one."""
         image = None
         if connected.grab_waits:
@@ -283,6 +286,7 @@ class Reader:
                 self._condition.notify_all()
 
     def _report_loss(self, why: str) -> None:
+        """Store why the source was lost, and wake those that wait."""
         with self._condition:
             self._lost = why
             self._condition.notify_all()

@@ -20,7 +20,7 @@ _SYSFS = Path("/sys/class/video4linux")
 
 
 def describe_source(source: int | str) -> str:
-    """The source's name for messages; an address without its password."""
+    """Return the source's name for messages; an address without its password."""
     if isinstance(source, int):
         return f"the camera {source}"
     if _is_address(source):
@@ -59,7 +59,7 @@ def connect(source: int | str, size: tuple[int, int] | None) -> Connected:
 
 
 def list_connected() -> list[str]:
-    """The connected webcams, a line each; opened only where the system does not list them."""
+    """List the connected webcams, a line each; opened only where the system does not list them."""
     if sys.platform == "linux":
         return list_sysfs_webcams(_SYSFS)
     _silence_libraries()
@@ -85,6 +85,7 @@ def list_sysfs_webcams(sysfs: Path) -> list[str]:
 
 
 def _open_webcam(source: int | str, size: tuple[int, int] | None) -> Connected:
+    """Open a webcam by the first backend that works, at `size` if supported. Raises DeviceError."""
     for backend in _WEBCAMS:
         capture = cv2.VideoCapture(source, backend)
         if capture.isOpened():
@@ -111,10 +112,12 @@ def _set_size(capture: cv2.VideoCapture, size: tuple[int, int]) -> bool:
 
 
 def _is_address(source: str) -> bool:
+    """Whether the source is a network address."""
     return "://" in source
 
 
 def _is_device(source: str) -> bool:
+    """Whether the source is a device file."""
     return source.startswith("/dev/")
 
 

@@ -43,7 +43,7 @@ _GROUPS: dict[tuple[int, str], tuple[int, tuple[tuple[_Bits, _Bits], ...]]] = {
 
 @dataclass(frozen=True)
 class PixelFormat:
-    """`kind` is Mono, BayerRG ..., RGB, RGBa, BGR or BGRa; `packing` "p", "Packed" or ""."""
+    """A pixel format of GenICam. `kind`: Mono, BayerRG ..., RGB, RGBa, BGR or BGRa; `packing`: "p", "Packed" or ""."""
 
     name: str
     kind: str
@@ -57,7 +57,7 @@ class PixelFormat:
 
     @property
     def colour(self) -> bool:
-        """Whether it carries colour."""
+        """Whether the format carries colour."""
         return self.kind != "Mono"
 
     @property
@@ -66,11 +66,12 @@ class PixelFormat:
         return len(self.kind) if self.kind in _ORDERS else 1
 
     def nbytes(self, size: tuple[int, int], padding: int = 0) -> int:
-        """Bytes of an image of `size` (width, height) whose rows end with `padding` bytes; lines are seamless at 0."""
+        """Return the bytes of an image (width, height) px whose rows end with `padding` bytes; seamless lines at 0."""
         width, height = size
-        return self._bytes(width * height) if padding == 0 else height * (self._bytes(width) + padding)
+        return self._count_bytes(width * height) if padding == 0 else height * (self._count_bytes(width) + padding)
 
-    def _bytes(self, pixels: int) -> int:
+    def _count_bytes(self, pixels: int) -> int:
+        """Return the number of bytes of so many consecutive pixels."""
         if self.packing == "Packed":
             return 3 * (pixels // 2) + 2 * (pixels % 2)
         stored = self.bits if self.packing else 8 * self.dtype.itemsize
@@ -80,17 +81,17 @@ class PixelFormat:
         """Fill `out`, contiguous (h, w), or (h, w, samples), of `dtype`, from the bytes of a buffer."""
         height, width = out.shape[:2]
         rows, pixels = (1, width * height) if padding == 0 else (height, width)
-        used = self._bytes(pixels)
+        used = self._count_bytes(pixels)
         lines = data[: self.nbytes((width, height), padding)].reshape(rows, used + padding)[:, :used]
         if self.packing:
-            _unpack(lines, out.reshape(rows, pixels), *_GROUPS[self.bits, self.packing])
+            _unpack_groups(lines, out.reshape(rows, pixels), *_GROUPS[self.bits, self.packing])
         elif self.bits == 8:
             np.copyto(out.reshape(rows, used), lines)
         else:
             np.copyto(out.reshape(rows, used // 2), np.ascontiguousarray(lines).view("<u2"))
 
     def view_samples(self, data: np.ndarray, size: tuple[int, int], padding: int = 0) -> np.ndarray:
-        """A buffer's samples (h, w), or (h, w, samples), of `dtype`: a view where they need no unpacking."""
+        """Return a buffer's samples (h, w), or (h, w, samples), of `dtype`: a view where they need no unpacking."""
         width, height = size
         shape = (height, width) if self.samples == 1 else (height, width, self.samples)
         if self.bits == 8 and padding == 0:
@@ -110,7 +111,7 @@ class PixelFormat:
 
 
 def pixel_format(name: str) -> PixelFormat | None:
-    """The format called `name`; None for an unsupported one."""
+    """Return the format called `name`; None for an unsupported one."""
     match = _NAME.fullmatch(name)
     if match is None:
         return None
@@ -124,7 +125,7 @@ def pixel_format(name: str) -> PixelFormat | None:
 
 
 def best_format(names: Sequence[str]) -> PixelFormat | None:
-    """The best of the formats `names` that a camera offers, None if none is supported.
+    """Return the best of the formats `names` that a camera offers; None if none is supported.
 
     Unpacked and up to 12 bits deep where there is such a one; a camera that offers colours is a colour camera, and
     its mosaic comes before colours that it would fill in itself and send as three.
@@ -134,7 +135,7 @@ def best_format(names: Sequence[str]) -> PixelFormat | None:
     return max(colours or formats, key=lambda f: (not f.packing, f.samples == 1, f.bits, -f.samples), default=None)
 
 
-def _unpack(lines: np.ndarray, out: np.ndarray, group: int, pixels: tuple[tuple[_Bits, _Bits], ...]) -> None:
+def _unpack_groups(lines: np.ndarray, out: np.ndarray, group: int, pixels: tuple[tuple[_Bits, _Bits], ...]) -> None:
     """Fill `out` (rows, n) uint16 from (rows, bytes) in groups, of which the last may be short."""
     count = len(pixels)
     groups = -(-out.shape[1] // count)
@@ -151,4 +152,5 @@ def _unpack(lines: np.ndarray, out: np.ndarray, group: int, pixels: tuple[tuple[
 
 
 def _shift_bits(bits: np.ndarray, shift: int) -> np.ndarray:
+    """Shift bits to the left as uint16; to the right where `shift` is negative."""
     return np.left_shift(bits, shift, dtype=np.uint16) if shift > 0 else np.right_shift(bits, -shift, dtype=np.uint16)

@@ -19,7 +19,7 @@ from slviewer.fringe.sequence import PatternSequence
 class CameraSettings:
     """Exposure time in ms, and gain as a factor on the grey levels (1 = none).
 
-    None: read from a device, it cannot tell; given to `Camera.apply`, it stays as it is.
+    None: read from a device, it is unknown; given to `Camera.apply`, it stays as it is.
     """
 
     exposure_ms: float | None = None
@@ -33,7 +33,7 @@ class CameraSettings:
 
 
 class Camera(Protocol):
-    """Takes single images on request; `name`, `size` and `dtype` can be read before it is open."""
+    """Grabs single frames on request; `name`, `size` and `dtype` can be read before it is open."""
 
     @property
     def name(self) -> str:
@@ -55,7 +55,7 @@ class Camera(Protocol):
         ...
 
     def close(self) -> None:
-        """Give it back; nothing happens when it is not open."""
+        """Release the device; nothing happens when it is not open."""
         ...
 
     def grab(self, out: np.ndarray) -> None:
@@ -63,7 +63,7 @@ class Camera(Protocol):
         ...
 
     def settings(self) -> CameraSettings:
-        """The current settings, read from the device."""
+        """Read the current settings from the device."""
         ...
 
     def apply(self, settings: CameraSettings) -> CameraSettings:
@@ -110,7 +110,7 @@ class Projector(Protocol):
         ...
 
     def close(self) -> None:
-        """Give it back; nothing happens when it is not open."""
+        """Release the device; nothing happens when it is not open."""
         ...
 
     def load(self, sequence: PatternSequence) -> None:
@@ -125,13 +125,13 @@ class Projector(Protocol):
         ...
 
     def show_level(self, grey: int | None) -> None:
-        """Show even light of grey level 0 ... 255, None for dark; returns when it is shown. Keeps what is loaded."""
+        """Show even light of grey level 0 ... 255, None for dark; returns when shown. The sequence stays loaded."""
         ...
 
 
 @dataclass(frozen=True)
 class Rig:
-    """A camera and a projector that look at the same place, under the name that the operator chose.
+    """A camera and a projector that view the same scene, under the name that the operator chose.
 
     `settle_ms` passes between "shown" and the grab: what was measured of the light's delay beyond the projector's word.
     """
@@ -143,7 +143,7 @@ class Rig:
 
     @contextmanager
     def opened(self) -> Iterator["Rig"]:
-        """Both devices open for the length of a `with`, and closed after it whatever happened."""
+        """Open both devices for a `with` block, and close them after it in any case."""
         self.open()
         try:
             yield self
@@ -189,7 +189,7 @@ def check_sequence(projector: Projector, sequence: PatternSequence) -> None:
 
 
 def check_index(projector: Projector, sequence: PatternSequence | None, index: int) -> PatternSequence:
-    """The loaded sequence, if frame `index` is in it. Raises DeviceError if none is loaded, else InputError."""
+    """Return the loaded sequence if it has frame `index`. Raises DeviceError if none is loaded, else InputError."""
     if sequence is None:
         raise DeviceError(f"{projector.name} has no patterns: load a sequence before showing a frame")
     if not 0 <= index < len(sequence.frames):
@@ -198,7 +198,7 @@ def check_index(projector: Projector, sequence: PatternSequence | None, index: i
 
 
 def check_level(grey: int | None) -> int:
-    """The grey level 0 ... 255 to show, 0 for dark. Raises InputError."""
+    """Return the grey level 0 ... 255 to show, 0 for dark. Raises InputError."""
     if grey is None:
         return 0
     if not 0 <= grey <= 255:

@@ -11,7 +11,7 @@ from slviewer.fringe.sequence import PatternSequence
 
 
 class Recording:
-    """Frames (n, h, w), uint8 or uint16, and the sequence that was projected; `play` puts another in its place."""
+    """Recorded frames (n, h, w), uint8 or uint16, and the sequence that was projected; `play` replaces both."""
 
     def __init__(self, frames: np.ndarray, sequence: PatternSequence) -> None:
         _check_recording(frames, sequence)
@@ -19,7 +19,7 @@ class Recording:
         self.visible_frame: np.ndarray | None = None  # (h, w) of the pattern shown; None: not recorded
 
     def play(self, frames: np.ndarray, sequence: PatternSequence) -> None:
-        """Play another capture of the same rig, from any thread; a capture that is running ends with the old one."""
+        """Play another capture of the same rig; a running capture then ends with the old one. For any thread."""
         _check_recording(frames, sequence)
         before, projector = self.played[0], self.played[1].projector
         if frames.shape[1:] != before.shape[1:] or frames.dtype != before.dtype or sequence.projector != projector:
@@ -40,7 +40,7 @@ class ReplayCamera(Openable):
         self.size, self.dtype = (width, height), recording.played[0].dtype
 
     def grab(self, out: np.ndarray) -> None:
-        """The recorded frame of the pattern shown; under even light of any level, the recorded texture."""
+        """Copy the recorded frame of the pattern shown; under even light of any level, the recorded texture."""
         self.check_open()
         check_frame(self, out)
         if self._recording.visible_frame is None:
@@ -48,12 +48,12 @@ class ReplayCamera(Openable):
         out[:] = self._recording.visible_frame
 
     def settings(self) -> CameraSettings:
-        """Unknown settings: all None."""
+        """Return unknown settings: all None."""
         self.check_open()
         return CameraSettings()
 
     def apply(self, settings: CameraSettings) -> CameraSettings:
-        """Set nothing; returns unknown settings."""
+        """Set nothing; return unknown settings."""
         return self.settings()
 
 
@@ -73,7 +73,7 @@ class ReplayProjector(Openable):
         self.show_level(None)
 
     def load(self, sequence: PatternSequence) -> None:
-        """Accept the recorded sequence. Raises DeviceError for any other."""
+        """Load the recorded sequence. Raises DeviceError for any other."""
         self.check_open()
         played = self._recording.played
         if sequence != played[1]:
@@ -84,7 +84,7 @@ class ReplayProjector(Openable):
         self._loaded = played
 
     def show(self, index: int) -> None:
-        """Make frame `index` the camera's next one."""
+        """Select frame `index` as the camera's next one."""
         self.check_open()
         frames, sequence = self._loaded or (None, None)
         check_index(self, sequence, index)
@@ -103,12 +103,12 @@ class ReplayProjector(Openable):
 
 
 def replay(frames: np.ndarray, sequence: PatternSequence) -> Rig:
-    """A rig that replays `frames` (n, h, w) of `sequence`, not copied. Raises InputError if they do not fit."""
+    """Return a rig that replays `frames` (n, h, w) of `sequence`, not copied. Raises InputError if they do not fit."""
     return recording_rig(Recording(frames, sequence))
 
 
 def recording_rig(recording: Recording) -> Rig:
-    """A rig that replays `recording`, on which more captures can be played later."""
+    """Return a rig that replays `recording`, on which more captures can be played later."""
     return Rig("replay", ReplayCamera(recording), ReplayProjector(recording))
 
 
@@ -116,6 +116,7 @@ DRIVER = Driver("replay", "a recorded capture, played back", needs="frames and t
 
 
 def _check_recording(frames: np.ndarray, sequence: PatternSequence) -> None:
+    """Raise InputError unless frames are (n, h, w) uint8 or uint16, one for each pattern."""
     if frames.ndim != 3 or frames.dtype not in (np.uint8, np.uint16) or len(frames) != len(sequence.frames):
         raise InputError(
             f"{len(sequence.frames)} frames (n, h, w) of uint8 or uint16 are needed for this sequence, "
@@ -124,6 +125,7 @@ def _check_recording(frames: np.ndarray, sequence: PatternSequence) -> None:
 
 
 def _describe_sequence(sequence: PatternSequence) -> str:
+    """Describe a sequence for messages: number of frames, projector size, kinds and periods."""
     width, height = sequence.projector
     kinds = sorted({frame.kind for frame in sequence.frames})
     periods = sorted({frame.period_px for frame in sequence.frames if frame.kind == "phase"})

@@ -11,7 +11,7 @@ _EXACT_PX = 0.01  # browsers round the ratio to single precision; a window that 
 
 
 class Screen(msgspec.Struct, frozen=True):
-    """What the page reports of its window.
+    """Screen and window of the projector page, as it reports them.
 
     `dpr`: device pixels per page pixel. `inner`, `whole`: (width, height) of the window's inside and of its screen in
     page pixels. `box`: the inside in device pixels as the browser laid it out, None where a browser does not report it.
@@ -50,7 +50,7 @@ class Screen(msgspec.Struct, frozen=True):
 
 
 def refusal(screen: Screen, size: tuple[int, int] | None) -> str:
-    """Why patterns of `size` (width, height), where it is known, cannot be shown there, and what to change; or ""."""
+    """Return why patterns of `size` (width, height; None: unknown) cannot be shown there, with a remedy; else ""."""
     if not screen.visible:
         return (
             "the projector page is hidden: bring its window to the front of the projector's screen, and leave nothing "

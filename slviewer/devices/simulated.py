@@ -25,7 +25,7 @@ _WHITE = 0.85  # albedo of the plate for which the camera is exposed while the p
 
 
 class SimulatedCamera(Openable):
-    """8-bit frames with the rig's noise; light grows with the exposure, and is cut off at 255."""
+    """Simulated 8-bit camera with the rig's noise; light grows with the exposure, and saturates at 255."""
 
     dtype = np.dtype(np.uint8)
 
@@ -48,18 +48,18 @@ class SimulatedCamera(Openable):
         width, height = renderer.rig.camera.size
         frame = out if (width, height) == self.size else np.empty((height, width), np.uint8)
         assert self._settings.exposure_ms is not None and self._settings.gain is not None
-        exposure = _auto_exposure(renderer) * self._settings.exposure_ms
+        exposure = _estimate_white_level(renderer) * self._settings.exposure_ms
         renderer.frame(shown.pattern, keys, frame, lamp=shown.lamp, exposure=exposure, gain=self._settings.gain)
         if frame is not out:
             cv2.resize(frame, self.size, dst=out, interpolation=cv2.INTER_LINEAR)
 
     def settings(self) -> CameraSettings:
-        """What is set."""
+        """Return the current settings."""
         self.check_open()
         return self._settings
 
     def apply(self, settings: CameraSettings) -> CameraSettings:
-        """Set it within 0.01 ... 100 ms and 1 ... 16 times."""
+        """Set exposure and gain, limited to 0.01 ... 100 ms and 1 ... 16 times."""
         self.check_open()
         exposure, gain = (
             before if wanted is None else min(max(wanted, low), high)
@@ -84,7 +84,7 @@ class SimulatedProjector(Openable):
         self._loads, self._shows = 0, 0
 
     def open(self) -> None:
-        """Ready, dark, nothing loaded."""
+        """Open the projector: dark, nothing loaded."""
         super().open()
         self._sequence = None
         self.show_level(None)
@@ -96,7 +96,7 @@ class SimulatedProjector(Openable):
         super().close()
 
     def load(self, sequence: PatternSequence) -> None:
-        """Compute all its patterns. Raises InputError for those that cannot be made, or not for this projector."""
+        """Compute all patterns of a sequence. Raises InputError for an invalid one, or one for another projector."""
         self.check_open()
         check_sequence(self, sequence)
         self._profiles = [profile(sequence, k) for k in range(len(sequence.frames))]
@@ -107,14 +107,15 @@ class SimulatedProjector(Openable):
         """Show frame `index`."""
         self.check_open()
         check_index(self, self._sequence, index)
-        self._show(self._profiles[index], preview=False)
+        self._show_pattern(self._profiles[index], preview=False)
 
     def show_level(self, grey: int | None) -> None:
-        """Even light, for previews."""
+        """Show even light, for previews."""
         self.check_open()
-        self._show((None, np.full(self.size[0], check_level(grey), np.uint8)), preview=True)
+        self._show_pattern((None, np.full(self.size[0], check_level(grey), np.uint8)), preview=True)
 
-    def _show(self, pattern: tuple[Axis | None, np.ndarray], preview: bool) -> None:
+    def _show_pattern(self, pattern: tuple[Axis | None, np.ndarray], preview: bool) -> None:
+        """Show a pattern in the world, with the lamp's flicker and the noise seed of this frame."""
         self._shows += 1
         rig = self.world.rig
         seed = (rig.seed, self._loads, self._shows, 0xDE)
@@ -123,12 +124,12 @@ class SimulatedProjector(Openable):
 
 
 def simulated_rig(world: SimulatedWorld) -> Rig:
-    """The camera and projector that look into `world`."""
+    """Return the camera and projector that view `world`."""
     return Rig("simulated", SimulatedCamera(world), SimulatedProjector(world))
 
 
 def preset_rig(preset: str = "letter", scale: float = 1.0, seed: int = 0, board: str = "circles:21x16:9") -> Rig:
-    """A preset's rig and a board, such as "circles:21x16:9"; the camera's size is the preset's times `scale`."""
+    """Return a preset's rig with a board, such as "circles:21x16:9"; `scale` multiplies the camera's size."""
     if preset != "letter":
         raise InputError(f"no rig preset is called {preset!r}: use letter")
     return simulated_rig(SimulatedWorld(letter(scale, seed), Board.parse(board)))
@@ -137,8 +138,8 @@ def preset_rig(preset: str = "letter", scale: float = 1.0, seed: int = 0, board:
 DRIVER = Driver("simulated", "a rig that exists in numbers only, with known truth", rig=preset_rig)
 
 
-def _auto_exposure(renderer: Renderer) -> float:
-    """Grey levels of full white light on an albedo of 1; for a white plate in focus where nothing is illuminated."""
+def _estimate_white_level(renderer: Renderer) -> float:
+    """Return the grey level of full white light on an albedo of 1, from the brightness of the scene."""
     if renderer.truth().mask.any():
         return renderer.exposure
     sensor, light = renderer.rig.sensor, renderer.rig.light

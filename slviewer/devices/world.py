@@ -26,7 +26,7 @@ _DRAFT_SCALE = 0.25  # of a preview while things move: the geometry of 400x300 r
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """What the projector shows: pattern as `fringe.profile` gives it, the lamp's relative light, the noise's seed.
+    """What the projector shows: pattern as `fringe.profile` returns it, the lamp's relative light, the noise's seed.
 
     Under even light, `preview`, a moving scene may be drawn as a draft.
     """
@@ -38,7 +38,7 @@ class Shown:
 
 
 class SimulatedWorld:
-    """One rig's surroundings, shared by its camera and its projector. Things may be moved from any thread.
+    """The scene of a simulated rig, shared by its camera and projector. Things may be moved from any thread.
 
     One thing is in view at a time; the others keep their poses for later. A pose is T_camera_thing: the board's
     origin is its first feature, the plane's its middle, the sphere's its centre, the object's its own.
@@ -50,7 +50,7 @@ class SimulatedWorld:
         self._draft_rig = replace(rig, camera=replace(rig.camera, scale=min(rig.camera.scale, _DRAFT_SCALE)))
         self._lock = threading.RLock()
         self._things: dict[Thing, Scene] = {
-            "plane": blank_board(_initial_pose("plane")),
+            "plane": blank_board(_make_initial_pose("plane")),
             "sphere": sphere((0.0, 0.0, _INITIAL_DEPTHS_MM["sphere"])),
         }
         self._standing: Thing = "board"
@@ -72,19 +72,19 @@ class SimulatedWorld:
     @property
     def board(self) -> Board:
         """The printed board geometry."""
-        board = self._board().board
+        board = self._get_board_scene().board
         assert board is not None
         return board
 
     @property
     def shape(self) -> BoardShape:
         """The board's deviation from flat, and of its features from their nominal positions."""
-        return self._board().shape
+        return self._get_board_scene().shape
 
     @property
     def pose(self) -> Pose:
         """T_camera_thing of the thing in view; identity rotation for a sphere."""
-        return _pose_of(self.scene)
+        return _get_pose(self.scene)
 
     @property
     def turn_deg(self) -> float:
@@ -99,24 +99,25 @@ class SimulatedWorld:
         """
         middle = (board.points.min(0) + board.points.max(0)) / 2
         pose = Pose(np.eye(3), np.array([0, 0, _INITIAL_DEPTHS_MM["board"]]) - middle)
-        self._put("board", printed_board(board, pose, shape, self.rig.seed))
+        self._store_scene("board", printed_board(board, pose, shape, self.rig.seed))
 
     def place(self, thing: Thing, pose: Pose | None = None) -> None:
-        """Put `thing` in view at T_camera_thing, in place of the current one; None: at its last pose."""
+        """Place `thing` in view at T_camera_thing, in place of the current one; None: at its last pose."""
         if thing not in get_args(Thing):
             raise InputError(f"the simulated world has no {thing!r}: use one of {', '.join(get_args(Thing))}")
         if pose is not None and not (np.isfinite(pose.R).all() and np.isfinite(pose.t).all()):
             raise InputError("a pose with numbers that are not finite places nothing: give a turn and mm")
         with self._lock:
-            scene = self._things[thing] if thing in self._things else demo_object(_initial_pose(thing))
+            scene = self._things[thing] if thing in self._things else demo_object(_make_initial_pose(thing))
             if pose is not None:
-                scene = _with_pose(scene, pose)
+                scene = _move_scene(scene, pose)
             self._standing = thing
-            self._put(thing, scene)
+            self._store_scene(thing, scene)
 
     def move(self, distance_mm: float | None = None, turn_deg: float | None = None) -> None:
-        """Move the thing in view along its camera ray to depth `distance_mm`, and turn it to `turn_deg` about the
-        vertical; None: unchanged.
+        """Move the thing in view along its camera ray to depth `distance_mm`, and turn it about the vertical.
+
+        `turn_deg` is the new rotation; None: unchanged.
         """
         with self._lock:
             pose = self.pose
@@ -126,7 +127,7 @@ class SimulatedWorld:
             self.place(self._standing, Pose(R @ pose.R, t))
 
     def renderer(self, preview: bool) -> Renderer:
-        """A renderer of the current scene; for previews of a moving scene a draft, (h, w) at a smaller scale."""
+        """Return a renderer of the scene; for previews soon after a motion, one of a smaller camera scale."""
         with self._lock:
             draft = preview and time.monotonic() - self._moved < _SETTLED_S
             draft = draft and self._draft_rig.camera.scale < self.rig.camera.scale
@@ -134,33 +135,38 @@ class SimulatedWorld:
                 self._renderers[draft] = Renderer(self._draft_rig if draft else self.rig, self._things[self._standing])
             return self._renderers[draft]
 
-    def _put(self, thing: Thing, scene: Scene) -> None:
+    def _store_scene(self, thing: Thing, scene: Scene) -> None:
+        """Store a thing's scene; if it is in view, note that it moved and drop its renderers."""
         with self._lock:
             self._things[thing] = scene
             if thing == self._standing:
                 self._moved = time.monotonic()
                 self._renderers.clear()
 
-    def _board(self) -> BoardScene:
+    def _get_board_scene(self) -> BoardScene:
+        """Return the scene of the board."""
         with self._lock:
             scene = self._things["board"]
         assert isinstance(scene, BoardScene)
         return scene
 
 
-def _pose_of(scene: Scene) -> Pose:
+def _get_pose(scene: Scene) -> Pose:
+    """Return the T_camera_thing of a scene; identity rotation for a sphere."""
     if isinstance(scene, Spheres):
         return Pose(np.eye(3), scene.centres[0])
     assert isinstance(scene, BoardScene | MeshScene)
     return scene.pose
 
 
-def _with_pose(scene: Scene, pose: Pose) -> Scene:
+def _move_scene(scene: Scene, pose: Pose) -> Scene:
+    """Return a scene moved to another pose; of a sphere only the centre moves."""
     if isinstance(scene, Spheres):
         return replace(scene, centres=pose.t[None].astype(float))
     assert isinstance(scene, BoardScene | MeshScene)
     return replace(scene, pose=pose)
 
 
-def _initial_pose(thing: Thing) -> Pose:
+def _make_initial_pose(thing: Thing) -> Pose:
+    """Return the pose at which a thing is first placed: in front of the camera at its default depth."""
     return Pose(np.eye(3), np.array([0.0, 0.0, _INITIAL_DEPTHS_MM[thing]]))
