@@ -23,14 +23,14 @@ from slviewer.errors import Cancelled, SlviewerError
 
 
 def describe_measurement(made: Any, **_: Any) -> str:
-    """The measurement in one line."""
+    """Describe a measurement in one line."""
     from slviewer.pipeline import measurements
 
     return measurements.describe_measurement(made)
 
 
 def describe_simulation(names: list[str], session: Path, **_: Any) -> str:
-    """How many captures were simulated, and the next command."""
+    """Describe how many captures were simulated, and the next command."""
     from slviewer.pipeline.simulate import TARGET
 
     return f"{len(names)} captures simulated into {session}; next: slviewer calibrate {session} --target {TARGET}"
@@ -91,7 +91,7 @@ COMMANDS: dict[str, Callable[..., Any]] = {
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run one command; returns the exit status."""
+    """Run one command; returns its exit status."""
     arguments = sys.argv[1:] if arguments is None else arguments
     if not arguments:
         arguments = ["wizard"]

@@ -29,7 +29,7 @@ class SessionError(SlviewerError):
 
 
 class DeviceError(SlviewerError):
-    """A camera or projector that does not answer, was unplugged, or cannot do what was asked."""
+    """A camera or projector that does not answer, was unplugged, or cannot do what was requested."""
 
 
 class CalibrationRejected(SlviewerError):

@@ -31,12 +31,12 @@ T = TypeVar("T")
 
 
 def to_plain(value: Any) -> Any:
-    """A dataclass, or anything that holds some, as plain values for JSON; TypeError for what has no plain form."""
+    """Convert a dataclass, or values that contain some, to plain values for JSON. Raises TypeError where impossible."""
     return msgspec.to_builtins(value, enc_hook=plain_leaf)
 
 
 def from_plain(data: Any, kind: type[T]) -> T:
-    """The value of type `kind` that `to_plain` made `data` from. Raises InputError that names the field amiss."""
+    """Rebuild the value of type `kind` from the `data` of `to_plain`. Raises InputError that names the field."""
     try:
         return msgspec.convert(data, kind, dec_hook=_array)
     except msgspec.ValidationError as error:
@@ -44,7 +44,7 @@ def from_plain(data: Any, kind: type[T]) -> T:
 
 
 def plain_leaf(value: Any) -> Any:
-    """NumPy values, paths and mappings that are no dicts, one step plainer; the hook of every JSON writer."""
+    """Convert a NumPy value, path or mapping one step towards plain values; the hook of every JSON writer."""
     if isinstance(value, np.generic | np.ndarray):
         return value.tolist()
     if isinstance(value, os.PathLike):
@@ -55,7 +55,7 @@ def plain_leaf(value: Any) -> Any:
 
 
 def _array(kind: Any, value: Any) -> Any:
-    """An array of the dtype that a field is annotated with, of the values' own where it names none."""
+    """Convert to an array of the dtype that a field is annotated with, of the values' own where it names none."""
     if kind is not np.ndarray and getattr(kind, "__origin__", None) is not np.ndarray:
         raise NotImplementedError(f"{kind} is no type of records")
     dtype = next(iter(get_args(get_args(kind)[1])), None) if get_args(kind) else None

@@ -27,7 +27,7 @@ CALIBRATED = (
 
 
 def run_calibrate(calibrate: Callable[..., Any], arguments: dict[str, Any]) -> None:
-    """Calibrate the camera alone where --camera-only asks for it, else the rig, and compare its models on request."""
+    """Calibrate the rig, or the camera alone with --camera-only; compare the models with --validate."""
     validated, camera_only, out, json_file = (arguments.pop(option.name) for option in CALIBRATED)
     if camera_only:
         from slviewer.pipeline.calibrate_camera import calibrate_camera_alone

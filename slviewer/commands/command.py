@@ -1,4 +1,4 @@
-"""A command of the terminal from a function of the program, whose signature and docstring nobody repeats.
+"""Makes a command of the terminal from the signature and the docstring of a function of the program.
 
 Both are read from the function's source, so that arguments are parsed and `--help` is shown before anything heavy, such
 as NumPy, is imported. The parameters that `Args:` of the docstring describes are the command's arguments; the others,
@@ -51,8 +51,9 @@ def read_command(
     description: str = "",
     run: Run | None = None,
 ) -> Callable[..., Callable[[], None]]:
-    """The command of the function ``module:function`` of slviewer, for tyro; its value is the work to do once all
-    arguments are parsed.
+    """Return the command of the function ``module:function`` of slviewer, for tyro.
+
+    The command's value is the work to do once all arguments are parsed.
 
     ``positional``: the parameters that are given without a name, ``options``: arguments that the function does not
     have, ``names``: {parameter: option} where these differ, ``defaults`` and ``description``: in place of the
@@ -60,14 +61,14 @@ def read_command(
     """
     module, _, name = source.partition(":")
     module = f"slviewer.{module}"
-    definition = _definitions(module)[name]
+    definition = _read_definitions(module)[name]
     assert isinstance(definition, ast.FunctionDef)
     doc = ast.get_docstring(definition) or ""
     described = re.match(r".*?^Args:\n(?:[ ].*\n?|\n(?=[ ]))*", doc, re.DOTALL | re.MULTILINE)
     doc = described[0] if described else re.split(r"\n\n", doc)[0]
     shown = re.findall(r"^ {4}(\w+):", doc, re.MULTILINE)
     parameters = []
-    for argument, default in _arguments(definition):
+    for argument, default in _list_arguments(definition):
         if argument.arg not in shown:
             continue
         assert argument.annotation is not None
@@ -80,12 +81,13 @@ def read_command(
             kind = Annotated[kind, tyro.conf.arg(name=names[argument.arg])]
         value = inspect.Parameter.empty if default is None else _evaluate(default, module)
         value = defaults.get(argument.arg, value)
-        parameters.append(_parameter(argument.arg, kind, value))
+        parameters.append(_make_parameter(argument.arg, kind, value))
     for each in options:
         kind = Annotated[each.type, tyro.conf.arg(help=each.help)]
-        parameters.append(_parameter(each.name, kind, each.default))
+        parameters.append(_make_parameter(each.name, kind, each.default))
 
     def parse(**arguments: Any) -> Callable[[], None]:
+        """Return the work to do: the function, imported only when it is called, with the parsed arguments."""
         return lambda: (run or show_result)(getattr(import_module(module), name), arguments)
 
     parse.__doc__ = description + doc[doc.index("\n\n") :] if description else doc
@@ -114,14 +116,14 @@ def show_result(
 
 
 def call(function: Callable[..., Any], **arguments: Any) -> Any:
-    """What the function returns; its progress and warnings go to standard error."""
+    """Call the function and return its result; its progress and warnings go to standard error."""
     callbacks = {"progress": terminal.progress, "warn": terminal.warn}
     heard = {name: callbacks[name] for name in callbacks if name in inspect.signature(function).parameters}
     return function(**arguments, **heard)
 
 
 def write_json(path: Path | None, result: object) -> None:
-    """Write a result, plain values or dataclasses, to the file that ``--json`` names; nothing without one."""
+    """Write a result, plain values or dataclasses, to the file of ``--json``; nothing without one."""
     if path is not None:
         from slviewer.records import to_plain  # lazily: it brings NumPy
 
@@ -130,17 +132,18 @@ def write_json(path: Path | None, result: object) -> None:
 
 
 def union(commands: Mapping[str, Callable[..., Any]]) -> Any:
-    """The type whose value is one of the commands, for tyro."""
+    """Return the type whose value is one of the commands, for tyro."""
     choices = [Annotated[Any, tyro.conf.subcommand(name=name, constructor=f)] for name, f in commands.items()]
     return Union[tuple(choices)]  # noqa: UP007 (built at run time)
 
 
-def _parameter(name: str, kind: Any, default: Any) -> inspect.Parameter:
+def _make_parameter(name: str, kind: Any, default: Any) -> inspect.Parameter:
+    """Return a keyword parameter of a command's signature."""
     return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, annotation=kind, default=default)
 
 
-def _arguments(definition: ast.FunctionDef) -> list[tuple[ast.arg, ast.expr | None]]:
-    """Every parameter of a function, and its default where it has one."""
+def _list_arguments(definition: ast.FunctionDef) -> list[tuple[ast.arg, ast.expr | None]]:
+    """List every parameter of a function with its default, None where it has none."""
     places, defaults = definition.args.args, definition.args.defaults
     required = [None] * (len(places) - len(defaults))
     keywords = zip(definition.args.kwonlyargs, definition.args.kw_defaults, strict=True)
@@ -148,8 +151,8 @@ def _arguments(definition: ast.FunctionDef) -> list[tuple[ast.arg, ast.expr | No
 
 
 @cache
-def _definitions(module: str) -> dict[str, ast.stmt]:
-    """{name: where it is defined or imported from} of a module's functions, types, constants and imports."""
+def _read_definitions(module: str) -> dict[str, ast.stmt]:
+    """Return {name: node that defines or imports it} of a module's functions, types, constants and imports."""
     spec = find_spec(module)
     assert spec is not None and spec.origin is not None
     definitions: dict[str, ast.stmt] = {}
@@ -166,14 +169,15 @@ def _definitions(module: str) -> dict[str, ast.stmt]:
 
 
 class _Names(dict[str, Any]):
-    """Types and constants of a module by name; those of slviewer are read from their source."""
+    """Mapping of a module's names to their types and constants; those of slviewer are read from their source."""
 
     def __init__(self, module: str) -> None:
         super().__init__(TYPES)
         self._module = module
 
     def __missing__(self, name: str) -> Any:
-        node = _definitions(self._module).get(name)
+        """Evaluate a name from the module's source, or import it. Raises KeyError."""
+        node = _read_definitions(self._module).get(name)
         if isinstance(node, ast.Assign | ast.AnnAssign) and node.value is not None:
             return _evaluate(node.value, self._module)
         if isinstance(node, ast.ImportFrom) and node.module is not None:
@@ -183,11 +187,12 @@ class _Names(dict[str, Any]):
 
 
 def _evaluate(expression: ast.expr, module: str) -> Any:
+    """Evaluate an annotation or a default of a module, without importing the module."""
     return eval(ast.unparse(expression), {}, _Names(module))
 
 
 def _terminal_type(kind: Any) -> Any:
-    """Without the second of two types that a terminal's text could be: addresses, ``str | Path``, stay text."""
+    """Return the type for the terminal: `str | Path` becomes the first of both, sequences become tuples."""
     choices = get_args(kind)
     if Path in choices and str in choices:
         first = next(choice for choice in choices if choice in (Path, str))

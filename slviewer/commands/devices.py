@@ -36,7 +36,7 @@ def run_capture(capture: Callable[..., Any], arguments: dict[str, Any]) -> None:
     """Capture, and print what the capture holds."""
     from slviewer.pipeline.inspect import summarise_capture
 
-    with _projector_page(arguments.pop("port")) as set_up:
+    with _serve_projector_page(arguments.pop("port")) as set_up:
         saved = call(capture, set_up=set_up, **arguments)
     print(summarise_capture(saved))
 
@@ -51,7 +51,7 @@ def run_preflight(check_rig: Callable[..., Any], arguments: dict[str, Any]) -> N
     if recorded is not None:
         checked = call(check_capture, session=recorded[0], capture=recorded[1])
     else:
-        with _projector_page(port) as set_up:
+        with _serve_projector_page(port) as set_up:
             checked = call(check_rig, set_up=set_up, **arguments)
     write_json(json_file, checked.to_dict())
     print(checked.text())
@@ -62,20 +62,21 @@ def run_preflight(check_rig: Callable[..., Any], arguments: dict[str, Any]) -> N
 
 
 @contextmanager
-def _projector_page(port: int) -> Iterator["SetUp"]:
-    """How rigs are set up; the projector page is served for one that needs it, until the block ends."""
+def _serve_projector_page(port: int) -> Iterator["SetUp"]:
+    """Yield the function that sets up rigs, which serves the projector page where needed until the block ends."""
     from slviewer.pipeline.rig_choice import Board, Choice, RigSetup, needs_page, set_up
 
     with ExitStack() as ended:
 
         def make(choice: Choice, board: Board | None) -> RigSetup:
-            return set_up(choice, board, channel=_connect(port, ended) if needs_page(choice) else None)
+            """Set up a rig, with a channel to the projector page where it needs one."""
+            return set_up(choice, board, channel=_connect_page(port, ended) if needs_page(choice) else None)
 
         yield make
 
 
-def _connect(port: int, ended: ExitStack) -> "Channel":
-    """The channel to the projector page, once it is open and ready. Raises DeviceError where nobody opens it."""
+def _connect_page(port: int, ended: ExitStack) -> "Channel":
+    """Serve the projector page and return the channel to it, once it is ready. Raises DeviceError on timeout."""
     from slviewer.devices.channel import Channel
     from slviewer.server.projector_page import PATH, serve_projector
     from slviewer.server.secure import serve

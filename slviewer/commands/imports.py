@@ -55,7 +55,7 @@ def run_frames(import_captures: Callable[..., Any], arguments: dict[str, Any]) -
     if folder is not None:
         if source is not None or sequence is not None:
             raise UsageError("--guess proposes a TOML and imports nothing: give it without SOURCE, SESSION, --sequence")
-        _propose(folder, out, arguments["projector"], arguments["channel"])
+        _propose_description(folder, out, arguments["projector"], arguments["channel"])
         return
     if source is None or session is None:
         raise UsageError("SOURCE or SESSION is missing: give both, or --guess FOLDER for a TOML")
@@ -79,7 +79,8 @@ def run_import_calibration(import_calibration: Callable[..., Any], arguments: di
     print(f"stereo calibration imported: camera {cw}x{ch}, projector {pw}x{ph}, baseline {model.baseline_mm:.1f} mm")
 
 
-def _propose(folder: Path, out: Path | None, projector: str | None, channel: str | None) -> None:
+def _propose_description(folder: Path, out: Path | None, projector: str | None, channel: str | None) -> None:
+    """Write the proposed TOML of a capture folder to `out` or standard output. Raises InputError for doubts."""
     from slviewer.pipeline.import_captures import guess_description
 
     guessed = guess_description(folder, projector=projector, channel=channel)  # type: ignore[arg-type]
@@ -93,9 +94,10 @@ def _propose(folder: Path, out: Path | None, projector: str | None, channel: str
         raise InputError(f"unsure: {'; '.join(guessed.doubts)}. Correct the entries marked UNSURE in the TOML")
 
 
-def _captures(
+def _make_captures_command(
     layout: str, description: str, *options: Option, run: Run | None = None, **defaults: Any
 ) -> Callable[..., Callable[[], None]]:
+    """Return the import command of a layout."""
     return read_command(
         "pipeline.import_captures:import_captures",
         "source",
@@ -108,37 +110,37 @@ def _captures(
 
 
 LAYOUTS = {
-    "auto": _captures(
+    "auto": _make_captures_command(
         "detect", "Import folders whose layout is known by their file names, or by a TOML that lies in the folder."
     ),
-    "p18": _captures(
+    "p18": _make_captures_command(
         "p18",
         "Import folders of the p18 layout: pose_XX/{V,H}/P18_FNN.PNG, 18 phase steps and 7 Gray bits an axis.",
         projector="912x1140",
     ),
-    "procam-calibration": _captures(
+    "procam-calibration": _make_captures_command(
         "procam-calibration",
         "Import folders of the procam-calibration layout: capture_N/graycode_NN.*, Gray code with "
         "inverses, white, black.",
         projector="1024x768",
     ),
-    "opencv-graycode": _captures(
+    "opencv-graycode": _make_captures_command(
         "opencv-graycode",
         "Import the images of OpenCV's structured_light GrayCodePattern: columns, then rows, each bit with its inverse."
         "\n\nImages are read in natural order of their names.",
         FILES,
     ),
-    "sltk": _captures(
+    "sltk": _make_captures_command(
         "sltk", "Import folders of the sltk layout: TIME_[AA-BB-CC_NN]_img.jpg, Gray code with inverses."
     ),
-    "slstudio": _captures(
+    "slstudio": _make_captures_command(
         "slstudio",
         "Import the frames that SLStudio writes: frameSeq_NN.bmp.\n\nWith the diamond pattern, the projector's size "
         "has twice its columns.",
         CODEC,
         AXIS,
     ),
-    "frames": _captures(
+    "frames": _make_captures_command(
         "frames",
         "Import any folder of images with a TOML that describes them, or propose that TOML with --guess FOLDER.",
         *DESCRIBED,

@@ -25,6 +25,7 @@ def wizard(
     """
 
     def start() -> None:
+        """Run the wizard in the browser."""
         from slviewer.gui.app import run
 
         run(session, rig, host, port, open_browser=not no_browser)

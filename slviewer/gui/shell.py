@@ -1,6 +1,6 @@
 """The frame of the page: the steps on the left, the current step on the right, and what is visible in every step.
 
-All browsers show the same step: whoever assists sees what the operator sees.
+All browsers show the same step: an assistant sees the operator's step.
 """
 
 import importlib

@@ -38,7 +38,7 @@ class Stream:
         self._read: LiveCapture | None = None
         self.has_ended = False
         self.captured = 0
-        """Number of complete captures, including those that nobody read."""
+        """Number of complete captures, including those that were not read."""
 
     def capture(self, rig: Rig, settings: CameraSettings, stopped: Callable[[], bool]) -> np.ndarray | None:
         """Show and grab every frame of the sequence, which the rig's projector has loaded.
@@ -102,7 +102,7 @@ class Stream:
     def _store_newest(self, shot: LiveCapture) -> None:
         """Make a capture the one to read next, and recycle one that was not read."""
         with self._condition:
-            self._recycle(self._waiting)  # nobody has read it
+            self._recycle(self._waiting)  # it was not read
             self._waiting = shot
             self.captured += 1
             self._condition.notify_all()

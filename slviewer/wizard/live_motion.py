@@ -1,8 +1,8 @@
 """Masks what moved during a short sequence: there, even a handful of frames contradict each other.
 
-The frames of every period have the same mean, the background, at a pixel that stands still; and where the finest has an
+The frames of every period have the same mean, the background, at a pixel without motion; and where the finest has an
 even number of steps, its frames added with alternating signs leave nothing but noise and what the projector adds
-evenly everywhere, its second harmonic, which is measured from all pixels and taken out.
+evenly everywhere, its second harmonic, which is measured from all pixels and subtracted.
 """
 
 import numba

@@ -204,7 +204,7 @@ class HandsFree:
     def __init__(self) -> None:
         self.is_on = False
         self._captured: np.ndarray | None = None  # the board's outline at the last capture
-        self._requested: float | None = None  # when the last capture was, until the board is seen after it
+        self._requested: float | None = None  # when the last capture was, until the board is detected after it
         self._begun: float | None = None
 
     def switch(self, on: bool) -> None:

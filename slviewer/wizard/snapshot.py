@@ -305,7 +305,7 @@ class SessionView:
 @dataclass(frozen=True)
 class LiveView:
     """A live scan: clouds computed per second, and of those shown; `latency_ms`: the median from the start of a cloud's
-    capture until it is sent to the screens, None where nobody watches; `points` of the latest cloud.
+    capture until it is sent to the screens, None where no browser is open; `points` of the latest cloud.
     """
 
     clouds_per_s: float

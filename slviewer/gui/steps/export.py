@@ -195,7 +195,9 @@ class Panel(StepPanel):
                 what, chosen, *_points(session, name), self._mesh.triangles if mesh else None
             )
             shown_type: What = "merged-mesh" if mesh and self._mesh.plan().method != "grid" else what
-            self._shape_note.write(describe_shape_file(session, shown_type, name, chosen, None if file else predicted), "dim")
+            self._shape_note.write(
+                describe_shape_file(session, shown_type, name, chosen, None if file else predicted), "dim"
+            )
             self._shape_link.set(self._link_html(file))
             self._shape_result.write(self._result_text(file) if file and mesh else "", "dim")
             is_own = file is not None and what == "merge" and chosen == "ply"  # the merge's own file
