@@ -38,13 +38,13 @@ def decode(
     scale = grey_scale(layout, noise, white * factor)._replace(white=clipped)
     maps = tuple(np.empty(stack.shape[1:], dtype) for dtype in (*[np.float32] * 4, np.uint8))
     if not layout.shifts:
-        kernels_gray.decode_gray(stack, scale, _gray_rules(layout), *maps)
+        kernels_gray.decode_gray(stack, scale, _gray_rules(layout), maps)
     elif layout.numbers_periods:
         mean = fringe_mean(layout, stack) if layout.is_plain else MIDDLE
-        kernels_coded.decode_coded(stack, pack_shifts(layout), scale, code_rules(layout, mean), *maps)
+        kernels_coded.decode_coded(stack, pack_shifts(layout), scale, code_rules(layout, mean), maps)
     else:
         ladder = pack_levels(layout, fringe_mean(layout, stack) if layout.gray else MIDDLE)
-        kernels_levels.decode_levels(stack, pack_shifts(layout), ladder, scale, *maps)
+        kernels_levels.decode_levels(stack, pack_shifts(layout), ladder, scale, maps)
     _repair_spikes(layout, maps[0], maps[-1])
     return complete_map(axis, layout, stack, clipped, maps, noise, factor)
 

@@ -8,9 +8,10 @@ import numpy as np
 from slviewer.fringe import limits
 from slviewer.fringe.kernels import (
     PER_TURN,
-    ROWS,
     TURN,
     TURN_REST,
+    Scale,
+    Shifts,
     allocate_five,
     is_clipped,
     is_dark,
@@ -19,7 +20,7 @@ from slviewer.fringe.kernels import (
     select_reason,
     shift_row,
 )  # fmt: skip
-from slviewer.geometry.jit import fma, kernel
+from slviewer.geometry.jit import fma, kernel, read_only, run_rows
 
 EDGE, FAR_EDGE = np.float32(limits.EDGE), np.float32(1 - limits.EDGE)
 WEAK, WEAKER, UNDECIDED = np.float32(limits.WEAK_BIT / 2), np.float32(limits.WEAKER), np.float32(limits.UNDECIDED_BIT)
@@ -185,10 +186,7 @@ def coded_row(stack, row, scale, rules, psi, B, A, peak, code, buffers, phase, r
 
 @kernel()
 def coded_rows(stack, shifts, scale, rules, first, phase, wrapped, modulation, background, reason):
-    """`decode_coded` of some rows from ``first`` on: the five maps hold only those.
-
-    A function of its own, which decoding and the pass to points share: it takes the compiler ten seconds.
-    """
+    """`decode_coded` of some rows from ``first`` on: the five maps hold only those."""
     width, steps = stack.shape[2], select_period(shifts, 0)
     peak, code, buffers = np.empty(width, stack.dtype), np.empty(width, np.int32), allocate_five(width)
     for i in range(len(phase)):
@@ -197,15 +195,18 @@ def coded_rows(stack, shifts, scale, rules, first, phase, wrapped, modulation, b
         coded_row(stack, row, scale, rules, psi, B, A, peak, code, buffers, phase[i], reason[i])
 
 
-@kernel(parallel=True)
-def decode_coded(stack, shifts, scale, rules, phase, wrapped, modulation, background, reason):
-    """Phase shift of one period with a plain or complementary Gray code; fills the five (h, w) maps.
+def decode_coded(
+    stack: np.ndarray, shifts: Shifts, scale: Scale, rules: CodeRules, maps: tuple[np.ndarray, ...]
+) -> None:
+    """Decode the phase shift of one period with a plain or complementary Gray code.
 
-    ``phase`` is NaN where ``reason`` is not VALID, here as in the other kernels.
+    Fills the five (h, w) ``maps``: phase, wrapped phase, modulation, background and reason. The phase is NaN where the
+    reason is not VALID, here as in the other kernels.
     """
-    height = stack.shape[1]
-    for block in numba.prange((height + ROWS - 1) // ROWS):
-        a, b = block * ROWS, min((block + 1) * ROWS, height)
-        coded_rows(
-            stack, shifts, scale, rules, a, phase[a:b], wrapped[a:b], modulation[a:b], background[a:b], reason[a:b]
-        )
+    stack = read_only(stack)
+
+    def decode(first: int, last: int) -> None:
+        """Decode a range of rows."""
+        coded_rows(stack, shifts, scale, rules, first, *(map[first:last] for map in maps))
+
+    run_rows(decode, stack.shape[1])

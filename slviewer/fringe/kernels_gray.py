@@ -2,12 +2,11 @@
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
 from slviewer.fringe import limits
-from slviewer.fringe.kernels import bit_height, is_dark, select_reason
-from slviewer.geometry.jit import kernel
+from slviewer.fringe.kernels import Scale, bit_height, is_dark, select_reason
+from slviewer.geometry.jit import kernel, read_only, run_rows
 
 TWO_PI = 2 * np.pi
 
@@ -27,13 +26,21 @@ class GrayRules(NamedTuple):
     sigma_part: float
 
 
-@kernel(parallel=True)
-def decode_gray(stack, scale, rules, phase, wrapped, modulation, background, reason):
-    """Projector column or row from Gray bits alone; fills the five (h, w) maps, ``wrapped`` with NaN."""
+def decode_gray(stack: np.ndarray, scale: Scale, rules: GrayRules, maps: tuple[np.ndarray, ...]) -> None:
+    """Decode the projector's column or row from Gray bits alone.
+
+    Fills the five (h, w) ``maps``, see `kernels_coded.decode_coded`; the wrapped phase is NaN.
+    """
+    run_rows(_gray_rows, stack.shape[1], read_only(stack), scale, rules, *maps)
+
+
+@kernel()
+def _gray_rows(start, stop, stack, scale, rules, phase, wrapped, modulation, background, reason):
+    """`decode_gray` of a range of rows."""
     gray, inverse, white, black = rules.gray, rules.inverse, rules.white, rules.black
-    _, height, width = stack.shape
+    width = stack.shape[2]
     per_px = TWO_PI / rules.cell
-    for row in numba.prange(height):
+    for row in range(start, stop):
         for x in range(width):
             B, A = np.float32(0), np.float32(0)
             if white >= 0 and black >= 0:

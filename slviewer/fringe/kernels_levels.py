@@ -6,9 +6,10 @@ import numba
 import numpy as np
 
 from slviewer.fringe.kernels import (
-    ROWS,
     TURN,
     TURN_REST,
+    Scale,
+    Shifts,
     allocate_five,
     arctan2,
     is_dark_squared,
@@ -17,7 +18,7 @@ from slviewer.fringe.kernels import (
     sums_row,
 )
 from slviewer.fringe.kernels_coded import UNDECIDED, WEAK, WEAKER
-from slviewer.geometry.jit import fma, kernel
+from slviewer.geometry.jit import fma, kernel, read_only, run_rows
 
 PER_RAD = 1 / (2 * np.pi)
 
@@ -199,13 +200,17 @@ def levels_rows(stack, shifts, ladder, scale, first, phase, wrapped, modulation,
         levels_row(psi, ladder, weakest, A, clipped, scale, cell, coordinate, order, own, worst, phase[i], reason[i])
 
 
-@kernel(parallel=True)
-def decode_levels(stack, shifts, ladder, scale, phase, wrapped, modulation, background, reason):
-    """Several periods, each by its own phase steps, and Gray cells, if any; fills the five (h, w) maps, of the finest
-    period."""
-    height = stack.shape[1]
-    for block in numba.prange((height + ROWS - 1) // ROWS):
-        a, b = block * ROWS, min((block + 1) * ROWS, height)
-        levels_rows(
-            stack, shifts, ladder, scale, a, phase[a:b], wrapped[a:b], modulation[a:b], background[a:b], reason[a:b]
-        )
+def decode_levels(
+    stack: np.ndarray, shifts: Shifts, ladder: Ladder, scale: Scale, maps: tuple[np.ndarray, ...]
+) -> None:
+    """Decode several periods, each by its own phase steps, and Gray cells, if any.
+
+    Fills the five (h, w) ``maps`` of the finest period; see `kernels_coded.decode_coded`.
+    """
+    stack = read_only(stack)
+
+    def decode(first: int, last: int) -> None:
+        """Decode a range of rows."""
+        levels_rows(stack, shifts, ladder, scale, first, *(map[first:last] for map in maps))
+
+    run_rows(decode, stack.shape[1])

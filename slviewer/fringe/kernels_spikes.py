@@ -15,7 +15,7 @@ from slviewer.fringe import limits
 from slviewer.fringe.layout import Layout
 from slviewer.fringe.levels import unambiguous_px
 from slviewer.fringe.phase import Reason
-from slviewer.geometry.jit import kernel
+from slviewer.geometry.jit import kernel, run_rows
 
 INCONSISTENT, OUTSIDE, UNCHANGED = np.uint8(Reason.INCONSISTENT), np.uint8(Reason.OUTSIDE), np.uint8(0)
 UP, DOWN = np.uint8(1), np.uint8(2)
@@ -123,22 +123,30 @@ def allocate_lists(shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, np.n
     return np.empty(shape, np.uint16), np.empty(shape, np.uint8), np.empty(shape[0], np.int64)
 
 
-@kernel(parallel=True)
-def list_changes(phase, rules, masking, columns, words, counts):
+def list_changes(
+    phase: np.ndarray, rules: SpikeRules, masking: bool, columns: np.ndarray, words: np.ndarray, counts: np.ndarray
+) -> None:
     """List what changes in ``phase`` (h, w): of row v, ``counts[v]`` pixels, at ``columns[v]``.
 
     ``masking``: pixels to mask, ``words[v]`` being their reasons; else those to be moved by a period, UP or DOWN.
     """
-    for row in numba.prange(phase.shape[0]):
-        counts[row] = _list_row(phase, row, rules, masking, columns[row], words[row])
+    run_rows(_list_rows, phase.shape[0], phase, rules, masking, columns, words, counts)
 
 
 @kernel()
-def _list_row(phase, row, rules, masking, columns, words):
-    """List the changes of one row: returns their number; columns and packed words are written."""
+def _list_rows(start, stop, phase, rules, masking, columns, words, counts):
+    """`list_changes` of a range of rows."""
+    width = phase.shape[1]
+    suspect, examined = np.empty(width, np.bool_), np.empty(width, np.bool_)
+    for row in range(start, stop):
+        counts[row] = _list_row(phase, row, rules, masking, columns[row], words[row], suspect, examined)
+
+
+@numba.njit
+def _list_row(phase, row, rules, masking, columns, words, suspect, examined):
+    """List the changes of one row: returns their number; columns and packed words are written, the rest are buffers."""
     width = phase.shape[1]
     low, high = np.float32(rules.low_rad), np.float32(rules.high_rad)
-    suspect, examined = np.empty(width, np.bool_), np.empty(width, np.bool_)
     _mark_suspects(phase, row, np.float32(1 / rules.cell_rad), suspect)
     own = phase[row]
     for x in range(width):

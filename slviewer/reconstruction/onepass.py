@@ -15,6 +15,7 @@ from slviewer.fringe.levels import unambiguous_px
 from slviewer.fringe.noise import measure_noise
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.fringe.threshold import MIDDLE, fringe_mean
+from slviewer.geometry.jit import read_only, run_rows
 from slviewer.geometry.rig import StereoRig
 from slviewer.reconstruction import onepass_kernels as kernels
 from slviewer.reconstruction.cloud import Cloud
@@ -124,8 +125,10 @@ class OnePass:
         frames, scan = self._begun(frames, light, out)
         deep = frames.dtype == np.uint16
         peaks = np.zeros(-(-self.shape[0] // kernels.ROWS) if deep else 0, np.int32)
-        kernels.sweep(
-            frames,
+        run_rows(
+            kernels.sweep_rows,
+            self.shape[0],
+            read_only(frames),
             self._shifts,
             self._ladder,
             code_rules(self._layout, scan.light.mean),
@@ -135,6 +138,7 @@ class OnePass:
             self._texture,
             np.array(self.sequence.select(self.axis)),
             peaks,
+            multiple=kernels.ROWS,
         )
         # a camera may turn out to have more bits than it seemed
         if deep and clip_level(frames.dtype, int(peaks.max())) > scan.light.white:

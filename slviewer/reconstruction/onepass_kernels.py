@@ -6,7 +6,6 @@ phase has beyond a reference, in float32.
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
 from slviewer.calibration.splined.correction_grid import add_corrections, locate_layers
@@ -48,20 +47,21 @@ class Maps(NamedTuple):
     texture: np.ndarray
 
 
-@kernel(parallel=True)
-def sweep(stack, shifts, ladder, rules, scale, depths, maps, texture, frames, peaks):
-    """Fill ``maps`` from the stack (n, h, w), whose frame ``texture`` shows the scene under white light, -1 for none.
+@kernel()
+def sweep_rows(start, stop, stack, shifts, ladder, rules, scale, depths, maps, texture, frames, peaks):
+    """Fill rows of ``maps`` from the stack (n, h, w); frame ``texture`` shows the scene under white light, -1 for none.
 
     ``peaks`` (blocks of rows,) int32, where it is not empty: the largest grey levels of the ``frames`` (k,).
 
     The parts are functions of their own, whose results lie in arrays of their own: the compiler then takes a tenth of
     the time, and knows that nothing overlaps.
     """
-    _, height, width = stack.shape
+    width = stack.shape[2]
     per_step = np.float32(2.0 / shifts.steps[-1])
-    for block in numba.prange((height + ROWS - 1) // ROWS):
-        first, last = block * ROWS, min((block + 1) * ROWS, height)
-        A, psi = np.empty((last - first, width), np.float32), np.empty((last - first, width), np.float32)
+    background, wrapped = np.empty((ROWS, width), np.float32), np.empty((ROWS, width), np.float32)
+    for first in range(start, stop, ROWS):
+        last = min(first + ROWS, stop)
+        A, psi = background[: last - first], wrapped[: last - first]
         phase, B, reason = maps.phase[first:last], maps.modulation[first:last], maps.reason[first:last]
         if len(rules.gray):
             coded_rows(stack, shifts, scale, rules, first, phase, psi, B, A, reason)
@@ -70,7 +70,7 @@ def sweep(stack, shifts, ladder, rules, scale, depths, maps, texture, frames, pe
         _measure(first, last, A, depths, scale, per_step, maps)
         _fill_texture(stack, texture, first, last, A, maps)
         if len(peaks):
-            peaks[block] = _brightest(stack, frames, first, last)
+            peaks[first // ROWS] = _brightest(stack, frames, first, last)
 
 
 @kernel()

@@ -141,13 +141,13 @@ def _time_kernel_alone(sequence: PatternSequence, frames: np.ndarray) -> Callabl
     """The decoding of axis x into arrays made before, with the noise known, and without a look at neighbours."""
     layout = axis_layout(sequence, "x")
     scale = grey_scale(layout, measure_noise(layout, frames, 255.0), 255.0)
-    maps = (*(np.zeros(frames.shape[1:], np.float32) for _ in range(4)), np.zeros(frames.shape[1:], np.uint8))
+    maps = tuple(np.zeros(frames.shape[1:], dtype) for dtype in (*[np.float32] * 4, np.uint8))
     shifts = pack_shifts(layout)
     if not layout.gray:
         ladder = pack_levels(layout)
-        return lambda: kernels_levels.decode_levels(frames, shifts, ladder, scale, *maps)
+        return lambda: kernels_levels.decode_levels(frames, shifts, ladder, scale, maps)
     rules = code_rules(layout, fringe_mean(layout, frames))
-    return lambda: kernels_coded.decode_coded(frames, shifts, scale, rules, *maps)
+    return lambda: kernels_coded.decode_coded(frames, shifts, scale, rules, maps)
 
 
 def _time_measuring(sequence: PatternSequence, frames: np.ndarray) -> list[Row]:
