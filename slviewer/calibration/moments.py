@@ -65,7 +65,11 @@ def _sum_linear_moments(phase, z, v, u, phase_ref, z_ref, a):
 
 @numba.njit
 def _sum_gauss_newton_moments(phase, z, v, u, phase_ref, z_ref, a0, a1, a2, a):
-    """Fill ``a`` with the sums of the depth residual linearised at the given coefficients; a[9]: its sum of squares."""
+    """Fill ``a`` (10,) with one pixel's Gauss-Newton sums for z = (a0 + a1 s) / (1 + a2 s) over the poses.
+
+    ``s`` is the phase less ``phase_ref``, z less ``z_ref``. a[:6]: upper triangle of the normal matrix, a[6:9]: its
+    right side, a[9]: sum of the squared residuals; poses with NaN are skipped.
+    """
     a[:] = 0.0
     for i in range(phase.shape[0]):
         s = phase[i, v, u] - phase_ref

@@ -138,7 +138,7 @@ def estimate_frame_light(sequence: PatternSequence, stack: np.ndarray) -> FrameL
 def equalize_frames(
     stack: np.ndarray, light: FrameLight, sequence: PatternSequence, frames: Sequence[int] | None = None
 ) -> tuple[np.ndarray, float]:
-    """(k, h, w) uint16 frames as they were under equal light, and the factor by which grey levels were multiplied.
+    """Scale frames to equal light: (k, h, w) uint16, and the factor by which grey levels were multiplied.
 
     ``frames``: indices of those that are wanted, all if None. Phase-shifted frames are 65535 throughout at pixels that
     the camera clipped in one of the frames of their period, and nowhere else. Room light is added to the frames that

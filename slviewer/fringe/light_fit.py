@@ -314,7 +314,7 @@ class Remainder:
     def solve(
         self, light: Light, terms: Sequence[Term], variance: float, share: float
     ) -> tuple[dict[Term, np.ndarray], float]:
-        """The change of each term (u, k), and of the share."""
+        """Solve the linearised fit: the step (u, k) of each term of the light, and that of the share."""
         normal, moment = self.normal_equations(light, terms, variance, share)
         into = self._by_changes(terms, light.changes, len(normal))
         solution = into @ np.linalg.solve(into.T @ normal @ into, into.T @ moment)

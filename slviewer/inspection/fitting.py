@@ -51,7 +51,7 @@ class FeatureFit:
     warnings: tuple[str, ...] = ()
 
     def quantities(self) -> list[Quantity]:
-        """The quantities of the feature, each with its uncertainty where that is known."""
+        """Return radius, diameter, form error and residuals of the feature, with uncertainties where known."""
         f, covariance = self.feature, self.spread.covariance
         known = self.spread.shared is not None
         listed: list[Quantity] = []

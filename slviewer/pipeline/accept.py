@@ -113,6 +113,7 @@ def accept(
             watching = part(progress, 0.5, 0.95)
 
             def clouds() -> Any:
+                """Yield depth and its standard deviation (h, w) mm of each capture of the still object."""
                 for i, (shot, _, phases) in enumerate(decode_captures(store, list(still))):
                     watching(i / len(still), f"repeating {shot.name}")
                     cloud = capture_cloud(store, chosen, shot, phases, warn=warn)

@@ -68,7 +68,7 @@ def format_bytes(count: int) -> str:
 
 
 def describe_format(file_format: str) -> str:
-    """What a format holds and in which units, in words."""
+    """Describe what a format contains and in which units."""
     return IN_WORDS.get(file_format) or DOCUMENTS.get(file_format, "")
 
 

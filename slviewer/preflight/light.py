@@ -14,7 +14,7 @@ _WHITE, _DARK = 24, 12
 
 @dataclass(frozen=True, eq=False)
 class Burst:
-    """``white`` (n, h, w) and ``dark``; ``white_s`` and ``dark_s`` (n,): when each began, s."""
+    """Images ``white`` (n, h, w) and ``dark`` (m, h, w); ``white_s`` (n,), ``dark_s`` (m,): when each began, s."""
 
     white: np.ndarray
     dark: np.ndarray
@@ -23,7 +23,7 @@ class Burst:
 
 
 def capture_burst(bench: RigUnderTest) -> Burst:
-    """Capture images in white light, then in the dark."""
+    """Capture several images in white light, then several in the dark, with the time at which each began."""
     white_s, white = _grab_images(bench, 255, _WHITE)
     dark_s, dark = _grab_images(bench, None, _DARK)
     return Burst(white, dark, white_s, dark_s)

@@ -126,6 +126,7 @@ def _depths(job: Job) -> tuple[Callable[..., Any], np.ndarray, np.ndarray]:
 
         @cuda.jit(device=True)
         def measure_splined(i, phase, c, grid):
+            """Return (x, y, z, |dz/dphi|) of pixel ``i`` at a phase, by the splined model's grid."""
             return splined(i, phase, c, grid, gain, centre, width, step, near, per_mm)
 
         return measure_splined, d.c, d.grid

@@ -157,7 +157,7 @@ def measure_moved(columns, words, counts, depths, maps):
 
 @kernel()
 def mask_points(columns, counts, maps):
-    """Mask the points whose phases `kernels_spikes.mask_phases` has masked."""
+    """Invalidate points and sigma_z at the pixels, ``counts`` per row in ``columns``, that ``mask_phases`` masked."""
     for row in range(len(counts)):
         for k in range(counts[row]):
             x = columns[row, k]

@@ -31,7 +31,7 @@ class Route(NamedTuple):
 
 
 class AuthMiddleware:
-    """Answers a server's requests: viser's page, our own pages and files, and who may open a WebSocket."""
+    """Authorises and answers a server's requests: viser's page, our own pages and files, and WebSockets."""
 
     def __init__(
         self, access: Access, routes: dict[str, Route], downloads: Downloads, page: bytes, scripts: tuple[str, ...]
@@ -44,7 +44,7 @@ class AuthMiddleware:
         self._scripts = scripts
 
     async def answer(self, connection: Connection, request: Request) -> Response | None:
-        """The answer, or None to open a WebSocket."""
+        """Return the response to a request, hardened; None to open a WebSocket."""
         try:
             return await self._answer(connection, request)
         except Refusal as refusal:
@@ -56,6 +56,7 @@ class AuthMiddleware:
         return response
 
     async def _answer(self, connection: Connection, request: Request) -> Response | None:
+        """Return the response to an authorised request, None to open a WebSocket; raises Refusal otherwise."""
         headers, access = request.headers, self._access
         host = access.host(headers, connection.transport.get_extra_info("sockname")[0])
         websocket = any(value.lower() == "websocket" for value in headers.get_all("Upgrade"))
@@ -93,7 +94,7 @@ class AuthMiddleware:
         return response
 
     def _accept_token(self, path: str, query: str, host: str, from_another_site: bool) -> Response:
-        """Answer to the link with the token: a cookie, and the same address without it.
+        """Respond to the link with the token: set a cookie, and redirect to the same address without the token.
 
         Any other parameter is refused: some make viser's page load messages, and so code, from elsewhere.
         """
@@ -116,6 +117,7 @@ class AuthMiddleware:
         return response
 
     async def _download(self, connection: Connection, path: str) -> Response:
+        """Stream an offered file; raises Refusal where it is no longer offered."""
         opened = self._downloads.open(path)
         if opened is None:
             raise Refusal(HTTPStatus.NOT_FOUND, "This file is no longer offered: request it again in slviewer.")

@@ -35,6 +35,7 @@ class ViserGate:
         self._uploads = Uploads(budget, self._forget_upload)
 
     def __call__(self, raw: Any) -> bytes | None:
+        """Return the bytes of a client's message to pass on to viser; None where it is refused and dropped."""
         if self._client is None:
             self._client = inside.client_of(self._server, self._connection)
         usable = isinstance(raw, bytes) and (self._role == "operator" or len(raw) < VIEWER_LIMIT)
@@ -52,14 +53,14 @@ class ViserGate:
         return None
 
     def close(self) -> None:
-        """The connection has ended."""
+        """Discard the uploads of the connection, which has ended."""
         self._uploads.close()
 
     def _check_message(self, message: Any, raw: bytes) -> bytes:
-        """The bytes to pass on to viser for this message; raises MessageRefused if it is not allowed."""
+        """Return the bytes to pass on to viser for this message; raises MessageRefused if it is not allowed."""
         server, client = self._server, self._client
         assert client is not None
-        # besides where they look from, those who watch may say that they have drawn something, when they are asked
+        # viewers may send their viewpoint, and confirm that something was drawn where that is requested
         watching = messages.ViewerCameraMessage | messages.LocalStorageGetItemResponseMessage
         if self._role != "operator" and not isinstance(message, watching):
             raise MessageRefused("this link only watches", correct=True)
@@ -106,7 +107,7 @@ class ViserGate:
                 raise MessageRefused("no message of clients")
 
     def _require_input(self, uuid: str) -> Any:
-        """The visible, enabled input with this id; raises MessageRefused otherwise."""
+        """Return the visible, enabled input with this id; raises MessageRefused otherwise."""
         assert self._client is not None
         handle = inside.gui_input(self._server, self._client, uuid)
         if handle is None:

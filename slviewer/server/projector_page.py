@@ -23,6 +23,7 @@ def serve_projector(server: SafeServer, channel: Channel) -> None:
     html = resources.files("slviewer.server").joinpath("projector.html").read_text("utf-8")
 
     async def handle(connection: ServerConnection) -> None:
+        """Exchange messages with a page until it disconnects."""
         with contextlib.suppress(ConnectionClosed):
             await _talk(connection, channel)
 
@@ -30,14 +31,16 @@ def serve_projector(server: SafeServer, channel: Channel) -> None:
 
 
 async def _talk(connection: ServerConnection, channel: Channel) -> None:
-    """Both directions, until one side ends it."""
+    """Exchange messages between a projector page and its channel until one side ends the connection."""
     loop, outbox = asyncio.get_running_loop(), asyncio.Queue[bytes | None]()
 
     def send(message: bytes | None) -> None:
+        """Queue a message to the page; None: close the connection."""
         with contextlib.suppress(RuntimeError):  # the server has stopped, and the page is gone with it
             loop.call_soon_threadsafe(outbox.put_nowait, message)
 
     async def write() -> None:
+        """Send queued messages to the page, and close the connection after the last."""
         while (message := await outbox.get()) is not None:
             await connection.send(message)
         await connection.close(ANOTHER_WINDOW, "another window is the projector")

@@ -86,7 +86,7 @@ def serve(
     names: tuple[str, ...] = (),
     upload_limit: int = 256 * 10**6,
 ) -> SafeServer:
-    """Start serving; port 0 takes any free one.
+    """Start the server of viser's page; port 0 takes any free one.
 
     `names` are further host names (`name` or `name:port`) under which browsers reach this server. `upload_limit` bounds
     the bytes of all unfinished uploads.
@@ -106,7 +106,10 @@ def serve(
         started: list[viser.ViserServer] = []
 
         def serve_viser(viser_handler: Callable[..., Any], _host: str, _port: int, **options: Any) -> serve_websockets:
+            """Start viser's WebSocket server behind the middleware, in place of its own."""
+
             async def handle(connection: ServerConnection) -> None:
+                """Handle a WebSocket: by the route of its path, else by viser behind a gate."""
                 assert isinstance(connection, Connection)
                 path = connection.request.path if connection.request else "/"
                 if path in routes:

@@ -88,7 +88,7 @@ def write_shape(
 def estimated_bytes(
     file_format: str, points: int, faces: int = 0, *, colours: bool = True, normals: bool = True, scalars: int = 0
 ) -> int:
-    """How large a file of so many points and faces becomes: within 1 % of the binary ones, some 20 % of texts."""
+    """Estimate the size of a file of so many points and faces: within 1 % of binary files, some 20 % of texts."""
     if file_format == "ply":
         return 300 + points * (12 + 12 * normals + 3 * colours + 4 * scalars) + faces * FACE.itemsize
     if file_format == "stl":

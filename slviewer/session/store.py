@@ -51,7 +51,7 @@ class Session:
 
     @classmethod
     def open(cls, path: str | Path, write: bool = False) -> "Session":
-        """An existing session, for reading, or for writing by this process alone.
+        """Open an existing session, for reading, or for writing by this process alone.
 
         Raises SessionError where there is no session, where it is damaged or of a newer schema, or where another
         process is writing to it.

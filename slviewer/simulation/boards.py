@@ -67,7 +67,7 @@ class BoardScene:
 
     @cached_property
     def features(self) -> np.ndarray:
-        """(n, 3) mm in the board's frame: where the features really are, bow and misplacement included."""
+        """True positions (n, 3) mm of the features in the board's frame, bow and misplacement included."""
         if self.board is None:
             return np.zeros((0, 3))
         xy = self.board.points[:, :2] + self.misplacement
@@ -124,7 +124,7 @@ def printed_board(
     diameter_mm: float | None = None,
     marked: bool = False,
 ) -> BoardScene:
-    """`board` printed on a plate with `margin_mm` around its outermost features (default 1.5 pitches).
+    """Return the scene of `board` printed on a plate, `margin_mm` around its outer features (default 1.5 pitches).
 
     `seed` draws the circles' misplacement, the same for every pose of one board. Circles are half a pitch wide unless
     `diameter_mm` says otherwise; `marked` adds the mark of the printed sheets. Raises `InputError` for ChArUco boards,

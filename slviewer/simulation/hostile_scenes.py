@@ -29,7 +29,7 @@ class SceneGroup:
     scenes: Sequence[Scene]
 
     def trace(self, rays: np.ndarray) -> Surface:
-        """The nearest surface of all scenes along each ray."""
+        """Return the nearest surface of all scenes along each ray."""
         first, *others = (scene.trace(rays) for scene in self.scenes)
         points, normals, albedo = first.points.copy(), first.normals.copy(), first.albedo.copy()
         for surface in others:

@@ -65,7 +65,7 @@ class FaultBench:
         return target_poses(self.rig, self.board, self.count)
 
     def frames(self, i: int) -> np.ndarray:
-        """(n, h, w) uint8: the capture of the i-th pose without a fault, cached."""
+        """Return the frames (n, h, w) uint8 of the i-th pose without a fault, cached."""
         if i not in self._frames:
             self._frames[i] = self.render(self.poses[i], i)
         return self._frames[i]
@@ -88,13 +88,13 @@ class FaultBench:
     def examine(
         self, i: int, frames: np.ndarray, sequence: PatternSequence | None = None, board: Board | None = None
     ) -> Judged:
-        """The reading of a capture with its evidence; ``sequence`` and ``board`` as described to the program."""
+        """Read a capture with its evidence; ``sequence`` and ``board`` as described to the program."""
         name, sequence, board = f"pose_{i + 1:02d}", sequence or self.sequence, board or self.board
         phases = decode_frames(name, sequence, frames)
         return read_pose(name, sequence, frames, phases, texture(sequence, frames), board, Smoothing(), examine=True)
 
     def examine_clean(self, count: int | None = None) -> list[Judged]:
-        """The readings of all, or the first ``count``, captures without a fault, cached."""
+        """Read all captures, or the first ``count``, without a fault; cached."""
         for i in range(self.count if count is None else count):
             if i not in self._examined:
                 frames = self._frames.get(i)
@@ -102,7 +102,7 @@ class FaultBench:
         return [self._examined[i] for i in range(self.count if count is None else count)]
 
     def attempt(self, captures: Sequence[Judged], board: Board | None = None) -> DiagnosedCalibration:
-        """The calibration from examined captures."""
+        """Calibrate from examined captures."""
         observations = [each.observation for each in captures if each.observation is not None]
         evidence = [each.evidence for each in captures if each.evidence is not None]
         return calibrate_with_diagnosis(observations, evidence, self.rig.projector.size, board or self.board)
@@ -123,7 +123,7 @@ class FaultBench:
         return self.attempt(captures, board)
 
     def attempt_with(self, i: int, frames: np.ndarray) -> DiagnosedCalibration:
-        """The calibration from all captures, one with other frames."""
+        """Calibrate from all captures, with the frames (n, h, w) of the i-th replaced."""
         captures = self.examine_clean()
         captures[i] = self.examine(i, frames)
         return self.attempt(captures)

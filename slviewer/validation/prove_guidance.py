@@ -150,7 +150,7 @@ def _observe_guided(rig: SimulatedRig, count: int, report: Progress) -> tuple[li
 
 
 def _observe_pose(rig: SimulatedRig, pose: Pose, number: int, report: Progress) -> Observation | None:
-    """The observation of the board rendered at a pose; None if it was not detected."""
+    """Render the board at a pose and observe it; None if it was not detected."""
     report(0.0, f"pose {number + 1}")
     try:
         return observe_rendered(rig, printed_board(BOARD, pose, seed=rig.seed), f"pose_{number + 1:02d}", number)

@@ -23,10 +23,10 @@ from slviewer.target.detect import detect
 def calibrate_rendered(
     rig: SimulatedRig, targets: Mapping[str, Scene], progress: Progress = ignore_progress
 ) -> tuple[StereoModel, SplinedModel, list[Observation]]:
-    """Both calibrations from rendered target poses, numbered in their order, and the observations, circles at their
-    centres.
+    """Render target poses, numbered in their order, and calibrate the stereo and the splined model from them.
 
-    Raises CalibrationRejected where the poses do not determine the rig.
+    Returns both models, and the observations with circles at their centres. Raises CalibrationRejected where the
+    poses do not determine the rig.
     """
     observations = []
     for i, (name, scene) in enumerate(targets.items()):
@@ -39,7 +39,10 @@ def calibrate_rendered(
 def calibrate_observed(
     rig: SimulatedRig, observations: list[Observation]
 ) -> tuple[StereoModel, SplinedModel, list[Observation]]:
-    """As ``calibrate_rendered``, from observations."""
+    """Calibrate the stereo and the splined model from observations of the target's poses.
+
+    Returns both models, and the observations with circles at their centres.
+    """
     stereo, observations = calibrate_centres(observations, rig.projector.size, TARGET)
     return stereo, calibrate_splined(observations, stereo), observations
 

@@ -48,7 +48,7 @@ class Reproduction:
 
     @property
     def in_range_ratio(self) -> float:
-        """Mean stereo RMS over mean pixelwise RMS, over the planes that lie at least 87 % in R2."""
+        """Mean stereo RMS over mean pixelwise RMS, over the planes with at least 87 % of their points in R2."""
         inside = [c for c in self.planes.values() if c.incidence and c.incidence["R2"] >= 87.0]
         means = [float(np.mean([c.results[m].rms_mm for c in inside])) for m in MODELS]
         return means[0] / means[1]

@@ -23,9 +23,10 @@ class GuessedDescription:
 def guess_description(
     folder: Path, projector: tuple[int, int] | None = None, channel: Channel | None = None
 ) -> GuessedDescription:
-    """What the images of a folder show, in natural order of their names; of a folder of captures, those of the first.
+    """Guess the pattern sequence of a folder's images, in natural order of their names, as a TOML with doubts.
 
-    Raises InputError where there are no images, or they cannot belong to one capture (other sizes, damaged).
+    Of a folder of captures, the first is read. Raises InputError where there are no images, or they cannot belong to
+    one capture (other sizes, damaged).
     """
     folder = _capture_folder(Path(folder).expanduser())
     files = images_by_name(folder)
