@@ -63,7 +63,7 @@ class StereoModel:
 
     @property
     def pinholes(self) -> StereoRig:
-        """The rig itself."""
+        """The rig as two pinhole cameras, which is the model itself."""
         return self.rig
 
     @property

@@ -43,7 +43,7 @@ class ErrorBudget:
         return tuple(c.source for c in self.contributions if c.u_mm is None)
 
     def text(self) -> str:
-        """For people."""
+        """Return the budget as a table for the terminal."""
         table = [
             {
                 "source": c.source,

@@ -72,14 +72,14 @@ class Comparison:
         return messages
 
     def region_text(self) -> str:
-        """Position of the measured region in the image, in words; empty where its map is not available."""
+        """Describe the position of the measured region in the image; empty where its map is not available."""
         rows, columns = np.flatnonzero(self.region.any(axis=1)), np.flatnonzero(self.region.any(axis=0))
         if not len(rows):
             return ""
         return f"columns {columns[0]}-{columns[-1]}, rows {rows[0]}-{rows[-1]}"
 
     def text(self) -> str:
-        """For people: a line a model, with the shares in R1, R2, R3 above."""
+        """Return a report for the terminal: a line per model, with the shares in R1, R2, R3 above."""
         table: list[Row] = []
         for model, result in self.results.items():
             row: Row = {"model": model, "RMS mm": result.rms_mm, "noise floor mm": result.noise_floor_mm}

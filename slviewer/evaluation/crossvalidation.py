@@ -77,7 +77,7 @@ class CrossValidation:
         return chosen
 
     def text(self) -> str:
-        """For people: a line a model."""
+        """Return a report for the terminal: a line per model."""
         table: list[Row] = [
             {
                 "model": model,

@@ -30,7 +30,7 @@ class Repeatability:
     sigma_map: np.ndarray
 
     def text(self) -> str:
-        """For people."""
+        """Return the result in one sentence for the terminal."""
         few = "" if self.captures >= CAPTURES else f" ({CAPTURES} are better)"
         return (
             f"repeatability over {self.captures} captures of a still object{few}: depth repeats to "
@@ -40,7 +40,7 @@ class Repeatability:
         )
 
     def to_json(self) -> dict[str, Any]:
-        """The fields without the map."""
+        """Return the fields without the map as plain values."""
         return {name: value for name, value in vars(self).items() if name != "sigma_map"}
 
 

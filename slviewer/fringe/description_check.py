@@ -151,7 +151,7 @@ def find_contradictions(
 
 
 def _detect_missing_pattern(sequence: PatternSequence, sample: LineSample) -> tuple[Contradiction, ...]:
-    """Captures that are dark, saturated, or show no pattern."""
+    """Detect that the captures are dark, saturated, or show no pattern."""
     grid = sample.grid[coded_frames(sequence)].astype(np.float32)
     high, low = grid.max(axis=0), grid.min(axis=0)
     share = float(np.mean(high - low > sample.least_swing))

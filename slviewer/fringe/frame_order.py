@@ -124,7 +124,10 @@ def _score(
 
 
 def _orders(sequence: PatternSequence) -> Iterator[tuple[Images, Contradiction, float]]:
-    """Images by frame, how that came about, and a penalty for frames that are nowhere; the simplest first."""
+    """Yield hypotheses of the frame order, the simplest first: lag, exchange, repetition, or a missing frame.
+
+    Each is (image of each frame, None for a missing one; the contradiction to report; a penalty).
+    """
     n = len(sequence.frames)
     for lag in (1, 2, -1):
         images = tuple(i + lag if 0 <= i + lag < n else None for i in range(n))

@@ -62,7 +62,7 @@ class Shifts(NamedTuple):
 
 @numba.njit(inline="always")
 def select_period(shifts, i):
-    """The `Steps` of one period."""
+    """Return the `Steps` of period ``i`` of packed shifts."""
     a, b = shifts.starts[i], shifts.starts[i + 1]
     lines = shifts.frames[a:b], shifts.cosines[a:b], shifts.sines[a:b]
     turn = shifts.turn_cosine, shifts.turn_sine

@@ -72,7 +72,7 @@ def _hash_source(module: str) -> tuple[bytes, tuple[str, ...]]:
 
 
 def _source_path(module: str) -> Path | None:
-    """The source file of a module; None where there is none of that name."""
+    """Return the source file of a module; None where there is none of that name."""
     parts = PACKAGE.parent.joinpath(*module.split("."))
     return next((path for path in (parts.with_suffix(".py"), parts / "__init__.py") if path.is_file()), None)
 

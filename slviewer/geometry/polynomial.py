@@ -83,7 +83,7 @@ def monomials(points: np.ndarray, degree: int) -> np.ndarray:
 
 
 def scale_to_unit_square(points: np.ndarray) -> np.ndarray:
-    """(n, 2): points (n, 2) scaled so that their extent along x and along y is -1 to 1."""
+    """Scale points (n, 2) so that their extent along x and along y is -1 to 1."""
     low = points.min(0)
     return np.asarray(2 * (points - low) / np.maximum(np.ptp(points, axis=0), 1e-9) - 1)
 

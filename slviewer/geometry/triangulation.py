@@ -115,7 +115,7 @@ def _check_map(rig: StereoRig, values: np.ndarray, what: str) -> None:
 
 
 def _as_read_only(values: np.ndarray) -> np.ndarray:
-    """Contiguous float64 that the kernels may read: one array type, so that they compile once."""
+    """Convert to read-only contiguous float64: one array type for the kernels, so that they compile once."""
     view = np.ascontiguousarray(values, dtype=np.float64).view()
     view.setflags(write=False)
     return view

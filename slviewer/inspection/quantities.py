@@ -20,11 +20,11 @@ class Quantity:
 
     @property
     def U(self) -> float | None:
-        """Expanded uncertainty, k = 2."""
+        """Expanded uncertainty, k = 2, in the quantity's unit."""
         return None if self.sigma is None else COVERAGE * self.sigma
 
     def text(self) -> str:
-        """For people."""
+        """Format the quantity with its uncertainty for the terminal."""
         digits = 1 if self.unit == "%" else 4
         unit = {"deg": "°", "%": " %", "": ""}.get(self.unit, f" {self.unit}")
         if self.U is None:

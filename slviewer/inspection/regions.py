@@ -38,7 +38,7 @@ class Region:
         return np.asarray((np.abs(offsets) <= self.size).all(axis=-1))
 
     def text(self) -> str:
-        """The region in words."""
+        """Describe the region."""
         at = ", ".join(f"{c:.1f}" for c in self.centre)
         if self.kind == "ball":
             return f"ball of radius {self.size[0]:.4g} mm at ({at})"

@@ -40,7 +40,7 @@ class AcceptanceResult:
     repeatability: Repeatability | None
 
     def to_json(self) -> dict[str, Any]:
-        """The contract of ``accept --json``."""
+        """Return the published values of ``accept --json``."""
         return self.acceptance.to_json() | {
             "scale_factor": self.factor,
             "scale_applied": self.applied,
@@ -49,7 +49,7 @@ class AcceptanceResult:
         }
 
     def text(self) -> str:
-        """For people."""
+        """Return the result as a report for the terminal."""
         blocks = [self.acceptance.text()]
         if self.factor != 1.0:
             blocks.append(f"a scale correction of {1e6 * (self.factor - 1):+.0f} ppm was in force during the test")

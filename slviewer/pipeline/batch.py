@@ -62,7 +62,7 @@ class Batch:
         return f"{len(self.failed)} of the batch failed: the summary names them, and why" if self.failed else ""
 
     def to_json(self) -> dict[str, Any]:
-        """The contract of ``batch --json``."""
+        """Return the published values of ``batch --json``."""
         sessions: dict[str, Any] = {address: {"failed": why, "captures": {}} for address, why in self.broken.items()}
         for done in self.done:
             captures = sessions.setdefault(done.session, {"failed": None, "captures": {}})["captures"]
@@ -74,7 +74,7 @@ class Batch:
         return {"do": self.task.do, "sessions": sessions}
 
     def text(self) -> str:
-        """For people: a table a session, then what failed and why."""
+        """Return a report for the terminal: a table per session, then what failed and why."""
         blocks = []
         for address in dict.fromkeys(done.session for done in self.done):
             rows = [{"capture": d.capture, **d.figures} for d in self.done if d.session == address and not d.failed]

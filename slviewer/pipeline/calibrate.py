@@ -57,7 +57,7 @@ class CalibrationResult:
         return self.splined or self.pixelwise or self.stereo
 
     def to_json(self) -> dict[str, Any]:
-        """The contract of ``calibrate --json``."""
+        """Return the published values of ``calibrate --json``."""
         rig = self.stereo.rig
         models: dict[str, Any] = {
             "stereo": {
@@ -85,7 +85,7 @@ class CalibrationResult:
         }
 
     def text(self) -> str:
-        """For people."""
+        """Return the result as a report for the terminal."""
         s = self.stereo
         rms, total = s.reprojection_rms_px, len(s.poses) + len(s.excluded)
         fc, fp = s.rig.camera.K, s.rig.projector.K

@@ -33,7 +33,7 @@ class DriftRecord:
     drift: Drift
 
     def to_json(self) -> dict[str, Any]:
-        """JSON-able."""
+        """Return the record as plain values."""
         return {"time": self.time, "calibration": self.calibration} | to_plain(self.drift)
 
 
@@ -50,11 +50,11 @@ class CheckResult:
         return self.latest.drift
 
     def to_json(self) -> dict[str, Any]:
-        """The contract of ``check --json``."""
+        """Return the published values of ``check --json``."""
         return self.latest.to_json() | {"before": [checked.to_json() for checked in self.before]}
 
     def text(self) -> str:
-        """For people: the answer, then the history."""
+        """Return a report for the terminal: the verdict, then the history."""
         lines = [self.drift.text()]
         if self.before:
             lines.append("earlier checks of this calibration:")
@@ -63,7 +63,7 @@ class CheckResult:
 
 
 def describe_check(checked: DriftRecord) -> str:
-    """One line of the history."""
+    """Describe one record of the history in a line."""
     d = checked.drift
     across = "" if d.across_px is None else f", {d.across_px:+.4f} px off its epipolar lines"
     return (

@@ -48,7 +48,7 @@ class Preflight:
         return {check.name: check for check in self.checks}[name]
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values for JSON."""
+        """Return plain values for JSON."""
         return {
             "verdict": self.verdict,
             "settle_ms": self.settle_ms,

@@ -45,7 +45,7 @@ class NominalComparison:
     measurement: Measurement | None
 
     def to_json(self) -> dict[str, Any]:
-        """The contract of ``compare --json``."""
+        """Return the published values of ``compare --json``."""
         return {
             "scan": self.scan,
             "model": self.model,
@@ -64,7 +64,7 @@ class NominalComparison:
         }
 
     def text(self) -> str:
-        """For people."""
+        """Return the result as a report for the terminal."""
         numbers = self.found.statistics()
         lines = [f"{self.scan} by {self.model} against {self.nominal.text()}"]
         lines += [f"{self.nominal.name}: {note}" for note in self.nominal.notes]
@@ -195,7 +195,7 @@ def compare_surface(
 
 
 def _figure_rows(numbers: dict[str, float], noise: float) -> list[Row]:
-    """The table of figures, mm."""
+    """Return the lines of the table of figures, mm."""
     return [
         {"deviation, mm": words, "value": f"{value:+.4f}" if signed else f"{value:.4f}"}
         for words, value, signed in (

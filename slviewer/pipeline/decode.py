@@ -56,7 +56,7 @@ class DecodedFiles:
         }
 
     def text(self) -> str:
-        """For people."""
+        """Return the result as a report for the terminal."""
         lines = []
         for axis, phase in self.phases.items():
             figures = axis_figures(phase)

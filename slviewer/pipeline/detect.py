@@ -78,7 +78,7 @@ class BoardsDetected:
         return "\n".join(lines)
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values."""
+        """Return the result as plain values."""
         return {
             "target": str(self.board),
             "images": [

@@ -50,14 +50,14 @@ _ALIASES = {"yaml": "yml", "htm": "html"}
 
 @dataclass(frozen=True)
 class Exported:
-    """A file that was written, and what it holds, in words."""
+    """An exported file, and a description of its content."""
 
     path: Path
     bytes: int
     words: str
 
     def text(self) -> str:
-        """For people."""
+        """Return the content, path, size and format of the file as text."""
         content = describe_format(self.path.suffix.lower().removeprefix("."))
         return f"{self.words}\n-> {self.path}, {format_bytes(self.bytes)}: {content}"
 

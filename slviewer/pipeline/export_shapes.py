@@ -33,7 +33,7 @@ class DescribedShape:
     done: tuple[str, ...] = ()
 
     def text(self) -> str:
-        """For people."""
+        """Return the result as a report for the terminal."""
         if isinstance(self.shape, Mesh):
             return f"{self.whose}: {'; '.join(self.done)}"
         return f"{self.whose}: {len(self.shape)} points"

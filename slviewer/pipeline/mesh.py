@@ -36,7 +36,7 @@ class MeshResult:
         return {"sources": list(self.sources), "out": str(self.out), **self.meshed.to_json(), "merge": merged}
 
     def text(self) -> str:
-        """For people."""
+        """Return the result as a report for the terminal."""
         lines = [] if self.merged is None else [self.merged.text()]
         return "\n".join([*lines, f"{', '.join(self.sources)}: {self.meshed.text()}", f"-> {self.out}"])
 

@@ -59,7 +59,7 @@ class Reconstruction:
     raised: float = 1.0
 
     def text(self) -> str:
-        """For people."""
+        """Return the result as a report for the terminal."""
         cloud = self.cloud
         z, sigma = cloud.points[..., 2][cloud.mask], cloud.sigma_z[cloud.mask]
         lines = [

@@ -45,7 +45,7 @@ def presets(session: Session | None = None) -> list[Preset]:
 
 
 def rigs(session: Session | None = None) -> str:
-    """The rigs that can be chosen by name, in words."""
+    """List the rigs that can be chosen by name, as text."""
     lines = ["rigs:"]
     for preset in presets(session):
         lines.append(f"  {preset.name}: {preset.what}" + (f" (not here: {preset.problem})" if preset.problem else ""))

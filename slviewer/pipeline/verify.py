@@ -57,7 +57,7 @@ class Verification:
         return data
 
     def text(self) -> str:
-        """For people."""
+        """Return the result as a report for the terminal."""
         blocks = [f"{name}:\n{comparison.text()}" for name, comparison in self.captures.items()]
         if distances := self.centre_distances_mm():
             table = [

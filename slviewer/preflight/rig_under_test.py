@@ -40,7 +40,7 @@ class RigUnderTest:
         self.illuminated = np.zeros(shape, bool)
 
     def grab(self) -> np.ndarray:
-        """The next image, sampled."""
+        """Grab the next image, sampled."""
         self.rig.camera.grab(self._frame)
         return self._frame[:: self.stride, :: self.stride].astype(np.float32)
 

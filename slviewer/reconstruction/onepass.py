@@ -121,7 +121,7 @@ class OnePass:
         return scan
 
     def sweep(self, frames: np.ndarray, light: LightLevels | None = None, out: PassResult | None = None) -> PassResult:
-        """The first pass: every pixel by itself; each frame is read once."""
+        """Run the first pass over frames: every pixel by itself; each frame is read once."""
         frames, scan = self._begun(frames, light, out)
         deep = frames.dtype == np.uint16
         peaks = np.zeros(-(-self.shape[0] // kernels.ROWS) if deep else 0, np.int32)

@@ -110,7 +110,7 @@ def section_plot(
 
 
 def deviations_section(deviations: Sequence[tuple[Measurement, Mapping[str, np.ndarray]]]) -> Section:
-    """The section with each comparison with a nominal model: verdict, picture and statistics."""
+    """Return the section with each comparison with a nominal model: verdict, picture and statistics."""
     items: list[Item] = []
     for measured, arrays in deviations:
         items += _deviation_items(measured, arrays)
@@ -186,13 +186,16 @@ def _deviation_table(view: Measurement) -> Table:
 
 
 def _decision_cell(decision: str) -> Cell:
-    """The table cell, in words and colour, of a decision: pass, fail or undecided."""
+    """Return the table cell of a decision, with its colour: pass, fail or undecided."""
     return Cell(DECIDED[decision], MARKS[decision])  # type: ignore[index]
 
 
 def draw_deviations(axes: Any, edges: np.ndarray, counts: np.ndarray, limit: float, tolerance: float | None) -> None:
-    """Bars of counts (n,) between edges (n + 1,) mm as shares of all, in the colours of the surface, whose scale ends
-    at ``limit`` mm; lines at plus and minus ``tolerance`` mm."""
+    """Draw the histogram of deviations as bars of counts (n,) between edges (n + 1,) mm, as shares of all.
+
+    The bars have the colours of the surface, whose scale ends at ``limit`` mm; lines mark plus and minus ``tolerance``
+    mm.
+    """
     middles = (edges[1:] + edges[:-1]) / 2
     axes.bar(
         middles,

@@ -116,7 +116,7 @@ def _draw_perspective(
     low: np.ndarray,
     high: np.ndarray,
 ) -> None:
-    """Draw the perspective view: depth runs away to the right, the image's up is up."""
+    """Draw the perspective view: depth increases to the right, the image's up is up."""
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
     style_image_axes(axes)

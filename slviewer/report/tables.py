@@ -206,5 +206,5 @@ def _format_muted_cells(values: Sequence[float], rows: int) -> list[str | Cell]:
 
 
 def _remove_mark(cell: str | Cell) -> str | Cell:
-    """The cell without its mark, unless it is muted."""
+    """Return the cell without its mark, unless it is muted."""
     return cell if isinstance(cell, str) or cell.mark == "muted" else Cell(cell.text)

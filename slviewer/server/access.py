@@ -74,7 +74,7 @@ class Access:
         )
 
     def set_cookie(self, role: Role) -> str:
-        """The Set-Cookie header of a role: HttpOnly, SameSite, for this browser session."""
+        """Return the Set-Cookie header of a role: HttpOnly, SameSite, for this browser session."""
         token = self.token if role == "operator" else self.view_token
         return f"{self.cookie_name}={token}; HttpOnly; SameSite=Strict; Path=/"
 

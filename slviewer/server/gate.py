@@ -154,7 +154,7 @@ def _is_finite(value: Any) -> bool:
 
 
 def check_value(handle: Any, value: Any) -> None:
-    """Raise MessageRefused unless the input takes this value, as it is in the message."""
+    """Raise MessageRefused unless the input accepts this value, as it is in the message."""
     match handle:
         case viser.GuiButtonHandle():
             _check(value is True, "a button is pressed, nothing else")

@@ -42,7 +42,7 @@ def page_policy(html: bytes, host: str) -> str:
 
 
 def viser_policy(scripts: tuple[str, ...], host: str) -> str:
-    """The same for viser's page, which besides unpacks itself with WebAssembly and works in a blob worker.
+    """Return the content security policy of viser's page, which unpacks itself with WebAssembly in a blob worker.
 
     Only viser's own scripts (given by their hashes) run, so that HTML in a label, a script or an event handler in it,
     does nothing even where someone forgot to escape it. They may evaluate text: parts of them are compiled so, and

@@ -37,7 +37,7 @@ class SafeServer:
 
     @property
     def url(self) -> str:
-        """The operator's link."""
+        """The operator's link, with the token."""
         return self.link("/")
 
     @property

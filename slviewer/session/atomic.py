@@ -47,7 +47,7 @@ def write_json(path: Path, data: Any) -> None:
 
 
 def to_json(data: Any) -> bytes:
-    """UTF-8 JSON for people and programs; NaN stays NaN, as Python's own reader understands it."""
+    """Encode as readable UTF-8 JSON; NaN stays NaN, as Python's own reader understands it."""
     return (json.dumps(data, indent=2, ensure_ascii=False, default=to_plain) + "\n").encode()
 
 
@@ -215,7 +215,7 @@ def _disk_full_error(folder: Path, needs_bytes: int) -> SessionError:
 
 
 def format_megabytes(size: int) -> str:
-    """Format a size in bytes for people: `96 MB`."""
+    """Format a size in bytes as text: `96 MB`."""
     return f"{size / 1e6:.0f} MB" if size >= 1e7 else f"{size / 1e6:.1f} MB"
 
 

@@ -105,7 +105,7 @@ class NewCapture:
 
     @property
     def nbytes(self) -> int:
-        """Bytes of frames and texture."""
+        """Total size of frames and texture, bytes."""
         return self.frames.nbytes + (0 if self.texture is None else self.texture.nbytes)
 
     def merged_frames(self) -> np.ndarray:

@@ -18,7 +18,7 @@ def safe_name(name: str) -> str:
 
 
 def safe_path(name: str) -> str:
-    """`name` itself if every part between its slashes is a safe name, as in `calibration/stereo`; else InputError."""
+    """Return `name` if every part between its slashes is a safe name, as in `calibration/stereo`; else InputError."""
     if not isinstance(name, str) or not name:
         raise InputError(f"{name!r} cannot be a name: use letters, digits, '_', '-' and '.', parts joined by '/'")
     for part in name.split("/"):

@@ -47,7 +47,7 @@ class Nominal:
         return np.ptp(self.mesh.vertices.astype(np.float64), axis=0)
 
     def text(self) -> str:
-        """Describe the model in words."""
+        """Describe the model: name, number of triangles, closed or open, and size in mm."""
         size = " x ".join(f"{side:.1f}" for side in self.size_mm)
         kind = "closed" if self.closed else "open"
         return f"{self.name}: {len(self.mesh.faces):,} triangles, {kind}, {size} mm"

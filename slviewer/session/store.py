@@ -192,7 +192,7 @@ class Session:
         return (self.folder / "results" / safe_path(name) / "meta.json").is_file()
 
     def save_result(self, name: str, meta: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> None:
-        """Save what was computed; replaces a result of that name in one step, which stays if this fails.
+        """Save a result; it replaces one of that name in one step, which stays if this fails.
 
         `meta["inputs"]` = {capture or result: its hash} is what `state_of` goes by; `input_hashes` gives it.
         """
@@ -245,7 +245,7 @@ class Session:
         atomic.move(max(places, key=lambda place: place.name), target)
 
     def input_hashes(self, *names: str) -> dict[str, str]:
-        """{name: content hash} of captures and results as they are now, for `meta["inputs"]`; InputError if absent."""
+        """Return {name: content hash} of captures and results, for `meta["inputs"]`. Raises InputError where absent."""
         hashes = {}
         for name in names:
             content_hashes = self._hashes(name)
@@ -255,7 +255,7 @@ class Session:
         return hashes
 
     def state_of(self, name: str) -> State:
-        """`fresh` if every input that a result names is there with the hash it had, and is fresh itself."""
+        """Return `fresh`, `stale` or `absent`; fresh if every input of the result is fresh and has the hash it had."""
         folder = self.folder / "results" / safe_path(name)
         if not (folder / "meta.json").is_file():
             return "absent"
@@ -304,7 +304,7 @@ class Session:
 
     @property
     def exports(self) -> Path:
-        """The folder for files made for other programs; made where it is missing."""
+        """The folder of exported files, created where it is missing."""
         folder = self.folder / "exports"
         try:
             folder.mkdir(exist_ok=True)

@@ -99,7 +99,7 @@ class BoardScene:
         return Surface(points, normals, albedo)
 
     def occluded(self, points: np.ndarray, source: np.ndarray) -> np.ndarray:
-        """A nearly flat plate shades no part of itself."""
+        """Return all False: a nearly flat plate shades no part of itself."""
         return np.zeros(len(points), bool)
 
     @cached_property

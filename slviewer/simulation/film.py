@@ -21,7 +21,7 @@ def psf_taps(sigma_px: float) -> np.ndarray:
 
 @kernel()
 def _hash_bits(x):
-    """A 32-bit hash (Wellons' lowbias32)."""
+    """Hash 32 bits to 32 bits (Wellons' lowbias32)."""
     x ^= x >> np.uint32(16)
     x = np.uint32(x * np.uint32(0x7FEB352D))
     x ^= x >> np.uint32(15)

@@ -63,12 +63,12 @@ class Fault:
     frames: Callable[[np.ndarray, float, Shot], np.ndarray] | None = None
 
     def level(self, severity: Severity) -> float:
-        """How strong."""
+        """Return the strength of the fault at a severity."""
         return self.levels[SEVERITIES.index(severity)]
 
     @property
     def is_optical(self) -> bool:
-        """Whether the light itself has to be rendered anew."""
+        """Whether the fault changes the light, which has to be rendered again."""
         return any((self.rig, self.scene, self.moving, self.pattern))
 
 
@@ -89,7 +89,7 @@ def render_light(
 def hostile_light(
     fault: Fault, severity: Severity, rig: SimulatedRig, scene: Scene, sequence: PatternSequence, number: int
 ) -> tuple[np.ndarray, Renderer]:
-    """As ``render_light``, with what the fault does to the rig, the scene and the patterns.
+    """Render the light as ``render_light``, with the fault's effects on rig, scene and patterns.
 
     Where the scene moves, the renderer is that of the middle of the phase steps of x, which depth comes from.
     """

@@ -79,13 +79,13 @@ class DirtyBoard:
         return Surface(surface.points, surface.normals, albedo.astype(np.float32))
 
     def occluded(self, points: np.ndarray, source: np.ndarray) -> np.ndarray:
-        """As of the clean board."""
+        """Return whether points are shaded, as for the clean board."""
         return self.scene.occluded(points, source)
 
 
 @dataclass(frozen=True, eq=False)
 class MirrorTable:
-    """A polished table below a thing: rays that pass the thing and meet the table see the thing mirrored.
+    """A polished table below an object: rays that miss the object and meet the table see the object mirrored.
 
     `normal` (3,) and `offset_mm`: the table is n . X = offset. `reflectivity` 0 ... 1. Points and normals of mirrored
     pixels are those of the real surface, which the projector lights; `is_direct` says which pixels see it directly.
@@ -97,7 +97,7 @@ class MirrorTable:
     reflectivity: float
 
     def trace(self, rays: np.ndarray) -> Surface:
-        """The thing, and below it its mirror image."""
+        """Trace rays to the object, and below it to its mirror image."""
         surface = self.scene.trace(rays)
         direct = np.isfinite(surface.points[..., 2])
         image = _mirror_scene(self.scene, self.normal, self.offset_mm).trace(rays)
@@ -112,11 +112,11 @@ class MirrorTable:
         return Surface(points, normals, albedo)
 
     def is_direct(self, rays: np.ndarray) -> np.ndarray:
-        """(h, w) bool: the pixels that see the thing itself, and not its mirror image."""
+        """Return the pixels (h, w) bool that see the object itself, and not its mirror image."""
         return np.isfinite(self.scene.trace(rays).points[..., 2])
 
     def occluded(self, points: np.ndarray, source: np.ndarray) -> np.ndarray:
-        """As of the thing alone: a polished table is below, and shades nothing of it."""
+        """Return whether points are shaded by the object; the table is below and shades nothing."""
         return self.scene.occluded(points, source)
 
     def second_projector(self, rig: SimulatedRig) -> SimulatedRig:
@@ -176,12 +176,12 @@ def _mirror_scene(scene: Scene, normal: np.ndarray, offset_mm: float) -> Scene:
 
 
 def set_gamma(rig: SimulatedRig, gamma: float, number: int) -> SimulatedRig:
-    """A projector with this gamma."""
+    """Return the rig with a projector of this gamma."""
     return replace(rig, light=replace(rig.light, gamma=gamma))
 
 
 def dim_projector(rig: SimulatedRig, amplitude: float, number: int) -> SimulatedRig:
-    """A projector whose fringes have this amplitude in grey levels on white, with the camera's exposure as it is."""
+    """Return the rig with fringes of this amplitude in grey levels on white; the camera's exposure is unchanged."""
     white = 2 * amplitude / (1 - rig.light.black)
     return replace(rig, sensor=replace(rig.sensor, peak_level=rig.sensor.dark_level + white * (1 + rig.light.ambient)))
 

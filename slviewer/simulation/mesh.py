@@ -38,7 +38,7 @@ class MeshScene:
         return self.pose.to_camera(self.vertices.astype(np.float64))
 
     def trace(self, rays: np.ndarray) -> Surface:
-        """The first triangle that each ray meets; triangles seen from behind count as nothing."""
+        """Return the first triangle that each ray meets; back faces are ignored."""
         shape = rays.shape[:2]
         directions = np.concatenate([rays, np.ones((*shape, 1))], -1)
         origin_and_way = np.concatenate([np.zeros_like(directions), directions], -1).astype(np.float32)
@@ -62,7 +62,7 @@ class MeshScene:
         return surface
 
     def occluded(self, points: np.ndarray, source: np.ndarray) -> np.ndarray:
-        """Whether the mesh stands between `points` and `source`."""
+        """Return whether the mesh is between `points` and `source`."""
         way = source - points
         lift = _LIFT_MM / np.linalg.norm(way, axis=-1, keepdims=True)
         cast = np.concatenate([points + lift * way, (1 - lift) * way], -1).astype(np.float32)

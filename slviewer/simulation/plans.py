@@ -72,10 +72,10 @@ def spheres() -> dict[str, Spheres]:
 
 
 def objects(moved: bool = False) -> dict[str, MeshScene]:
-    """The demo object in R1, R2 and R3, each time turned a little: the Letter's experiment 3.
+    """Return the demo object in R1, R2 and R3, each time turned a little: the Letter's experiment 3.
 
-    ``moved``: turned by up to
-    15 degrees from one to the next, and set down beside the axis."""
+    ``moved``: turned by up to 15 degrees from one to the next, and placed beside the axis.
+    """
     return {
         name: demo_object(Pose(rotation(np.radians(turns)), np.array(middle)))
         for name, (middle, turns) in _PLANS["moved_objects" if moved else "objects"].items()

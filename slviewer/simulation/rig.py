@@ -110,7 +110,7 @@ def _sample_lens(
     wavelengths: tuple[float, float],
     rms: float,
 ) -> SimulatedLens:
-    """A random lens of a device as its preset describes: with Brown distortion and local waves."""
+    """Sample a random lens of a device as its preset describes: with Brown distortion and local waves."""
     width, height = device["size"]
     focal = np.array(device["focal_px"]) * (1 + device["focal_spread"] * rng.uniform(-1, 1))
     middle = np.array([(width - 1) / 2, (height - 1) / 2]) + device["centre_offset_px"]

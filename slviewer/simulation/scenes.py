@@ -24,7 +24,7 @@ class Surface:
 
 
 class Scene(Protocol):
-    """Anything that can be rendered."""
+    """Protocol of scenes that can be rendered."""
 
     def trace(self, rays: np.ndarray) -> Surface:
         """What the camera rays (h, w, 2) = (x/z, y/z) meet."""
@@ -65,7 +65,7 @@ class Spheres:
         return Surface(points, normals, np.where(np.isfinite(depth), self.albedo, 0).astype(np.float32))
 
     def occluded(self, points: np.ndarray, source: np.ndarray) -> np.ndarray:
-        """Whether another part of the spheres lies on the way to `source`."""
+        """Return whether another part of the spheres is between the points and `source`."""
         way = source - points
         blocked = np.zeros(len(points), bool)
         for centre in self.centres:

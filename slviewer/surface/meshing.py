@@ -67,7 +67,7 @@ class MeshingPlan:
 
 @dataclass(frozen=True, eq=False)
 class BuiltMesh:
-    """A mesh and how it was made; what was not done is None. ``cell_mm``: the spacing of the points."""
+    """A mesh and how it was made; steps that were not done are None. ``cell_mm``: the spacing of the points."""
 
     mesh: Mesh
     method: Method
@@ -80,7 +80,7 @@ class BuiltMesh:
     topology: Topology
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values."""
+        """Return the figures as plain values."""
         plain: dict[str, Any] = {
             name: None if (step := getattr(self, name)) is None else asdict(step)
             for name in ("dropped", "trimmed", "filled", "smoothed", "thinned")
@@ -97,7 +97,7 @@ class BuiltMesh:
         }
 
     def text(self) -> str:
-        """For people."""
+        """Describe the mesh for the terminal."""
         lines = [f"{len(self.mesh.faces)} triangles by {self.method}, points {self.cell_mm:.2f} mm apart"]
         if self.dropped.parts:
             lines.append(f"{self.dropped.parts} floating parts left out, up to {self.dropped.largest_mm2:.1f} mm2")

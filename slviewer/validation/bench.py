@@ -65,12 +65,12 @@ class Benchmark:
     live: LiveFigures | None = None
 
     def to_json(self) -> dict[str, Any]:
-        """The rows as they are."""
+        """Return the rows as plain values."""
         figures = {"stages": self.rows, "peak_memory_gb": self.peak_memory_gb, "missing": list(self.missing)}
         return figures if self.live is None else figures | {"live": self.live.to_json()}
 
     def text(self) -> str:
-        """For people."""
+        """Return a table for the terminal."""
         lines = [render(self.rows), *self.missing]
         if self.peak_memory_gb is not None:
             lines.append(f"peak memory of the whole run {self.peak_memory_gb:.2f} GB")
@@ -264,7 +264,7 @@ def _time_calibration(scale: float, progress: Progress) -> list[Row]:
 
 
 def _time_fit(observations: list[Observation], stereo: StereoModel) -> tuple[float, float]:
-    """Seconds of smoothing all poses' phases and fitting the pixels to them, and the GB that this takes at most."""
+    """Measure the seconds to smooth all poses' phases and fit the pixels to them, and the peak memory, GB."""
     rng = np.random.default_rng(0)
     measured = {
         (o.name, axis): (o.smoothed_phase(axis) + rng.normal(0, 0.02, o.region.shape)).astype(np.float32)

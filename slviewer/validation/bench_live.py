@@ -66,11 +66,11 @@ class LiveFigures:
     growth_mb: float | None
 
     def to_json(self) -> dict[str, Any]:
-        """The figures by name."""
+        """Return the figures by name."""
         return asdict(self)
 
     def text(self) -> str:
-        """For people."""
+        """Return the figures as lines for the terminal."""
         growth = "unknown" if self.growth_mb is None else f"{self.growth_mb:+.1f} MB"
         return (
             f"live at {self.size[0]}x{self.size[1]} for {self.seconds:.0f} s: {self.shown_per_s:.1f} clouds/s sent to "
@@ -184,7 +184,7 @@ class _Viewer:
                     connection.send(msgspec.msgpack.encode({"type": kind, **answer}))
 
     def _connect(self) -> ClientConnection:
-        """An open WebSocket to the server with the view token, as viser's page opens it."""
+        """Open a WebSocket to the server with the view token, as viser's page does."""
         port, access = self._server.port, self._server.access
         host = f"127.0.0.1:{port}"
         return connect(

@@ -64,14 +64,17 @@ def fastest(work: Callable[[], object], times: int) -> float:
 
 
 def megabytes(*arrays: np.ndarray) -> float:
-    """Size of the arrays, MB."""
+    """Return the size of the arrays, MB."""
     return sum(a.nbytes for a in arrays) / 1e6
 
 
 @kernel(parallel=True)
 def move_bytes(frames, numbers, grey, single, triple):
-    """Reads ``frames`` (n, h, w) and float32 ``numbers`` (m, h, w) once, and writes ``grey`` (k, h, w) of 8 or 16 bits,
-    ``single`` (j, h, w) float32 and ``triple`` (i, h, w, 3) float32."""
+    """Move as many bytes as a decoder does, to measure the memory bandwidth.
+
+    Reads ``frames`` (n, h, w) and float32 ``numbers`` (m, h, w) once, and writes ``grey`` (k, h, w) of 8 or 16 bits,
+    ``single`` (j, h, w) float32 and ``triple`` (i, h, w, 3) float32.
+    """
     width = frames.shape[2]
     for y in prange(frames.shape[1]):
         whole, broken = np.zeros(width, frames.dtype), np.zeros(width, np.float32)
@@ -211,7 +214,7 @@ def icp_rows(points: np.ndarray) -> list[dict[str, Any]]:
 
 
 def _measure_seconds(work: Callable[[], object]) -> float:
-    """Median seconds; a cloud that may slide on itself is refused after the same work."""
+    """Measure the median seconds of `work`; registrations refused as ambiguous count too."""
 
     def tried() -> None:
         """Run the work and ignore its refusal."""

@@ -20,7 +20,7 @@ class BandCheck:
 
     @property
     def holds(self) -> bool:
-        """Whether the value lies in the band; False for NaN."""
+        """Whether the value is inside the band; False for NaN."""
         return self.least <= self.value <= self.most
 
     def text(self) -> str:
@@ -41,11 +41,11 @@ class Proof:
     below: Sequence[str] = ()
 
     def text(self) -> str:
-        """The table with its lines."""
+        """Return the table with its lines."""
         return "\n".join([*self.above, render(self.rows), *self.below])
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values; NaN becomes None."""
+        """Return plain values; NaN becomes None."""
         plain: dict[str, Any] = to_plain({"scale": self.scale, "holds": self.holds, **self.record})
         return {key: _without_nan(value) for key, value in plain.items()}
 

@@ -48,7 +48,7 @@ class Proofs:
         return "\n".join([*blocks, *lines])
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values by claim."""
+        """Return plain values by claim."""
         return {claim: proof.to_json() for claim, proof in self.proofs.items()}
 
 

@@ -175,7 +175,7 @@ def _solve_suggested_pose(rig: SimulatedRig, outline_px: np.ndarray) -> np.ndarr
 
 
 def _vary_pose(rig: SimulatedRig, T_camera_board: np.ndarray, rng: np.random.Generator) -> Pose:
-    """A pose near the given one with every feature in view, as a hand moves the board until it is detected."""
+    """Sample a pose near the given one with every feature in view, as a hand moves the board until it is detected."""
     middle = (BOARD.points.min(0) + BOARD.points.max(0)) / 2
     centre = T_camera_board[:3, :3] @ middle + T_camera_board[:3, 3]
     for k in range(_TRIES):

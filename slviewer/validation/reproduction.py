@@ -227,7 +227,7 @@ def _outline_plane(comparison: Comparison, rays: np.ndarray) -> np.ndarray:
 
 
 def _get_rms(comparison: Comparison) -> Mapping[str, float]:
-    """RMS of each model, mm."""
+    """Return the RMS of each model, mm."""
     return {m: r.rms_mm for m, r in comparison.results.items()}
 
 

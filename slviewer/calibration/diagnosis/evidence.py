@@ -118,5 +118,5 @@ class Evidence:
 
     @property
     def usable(self) -> tuple[PoseEvidence, ...]:
-        """Poses whose board and phase were read."""
+        """Evidence of the poses whose board and phase were read."""
         return tuple(pose for pose in self.poses if not pose.refused)

@@ -80,7 +80,7 @@ def judge(name: str, figures: Sequence[AcceptanceFigure], limit_mm: float | None
 
 
 def decide(figures: Sequence[AcceptanceFigure], limit_mm: float) -> Decision:
-    """Pass, fail or undecided: RULE."""
+    """Decide with a guard band: fail if any error exceeds the limit by more than U, pass if error + U never does."""
     if any(abs(figure.error_mm) - figure.U_mm > limit_mm for figure in figures):
         return "fail"
     return "pass" if all(abs(figure.error_mm) + figure.U_mm <= limit_mm for figure in figures) else "undecided"

@@ -36,7 +36,7 @@ class ScaleEstimate:
 
     @property
     def U_ppm(self) -> float:
-        """Expanded, k = 2."""
+        """Expanded uncertainty of the scale in ppm, k = 2."""
         return 2 * self.u_ppm
 
     def within(self, k: float) -> tuple[float, float]:
@@ -44,7 +44,7 @@ class ScaleEstimate:
         return self.ppm - k * self.u_ppm, self.ppm + k * self.u_ppm
 
     def to_json(self) -> dict[str, Any]:
-        """The fields and both intervals."""
+        """Return the fields and both intervals as plain values."""
         return to_plain(self) | {"within_95_ppm": self.within(K_95), "within_997_ppm": self.within(K_997)}
 
 
@@ -104,7 +104,7 @@ class Acceptance:
         return table
 
     def text(self) -> str:
-        """For people."""
+        """Return the result as a report for the terminal."""
         a = self.artefact
         lines = [
             f"{a.name} ({a.kind}), certificate: {a.certificate}",
@@ -132,7 +132,7 @@ class Acceptance:
         return "\n".join([*lines, f"This test {CLAIM}."])
 
     def to_json(self) -> dict[str, Any]:
-        """The contract of ``accept --json``."""
+        """Return the published values of ``accept --json``."""
         return to_plain(self) | {
             "scale": None if self.scale is None else self.scale.to_json(),
             "decision": self.decision,

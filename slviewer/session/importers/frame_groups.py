@@ -76,19 +76,19 @@ class _Inverse(_Group, tag="inverse"):
 
 
 class _Complementary(_Group, tag="complementary"):
-    """The complementary Gray code image."""
+    """Group of the complementary Gray code image."""
 
     pass
 
 
 class _White(_Group, tag="white"):
-    """The white image."""
+    """Group of the white image."""
 
     pass
 
 
 class _Black(_Group, tag="black"):
-    """The black image."""
+    """Group of the black image."""
 
     pass
 

@@ -135,7 +135,7 @@ def check_complete(images: Mapping[tuple[int, ...], Path], stem: str, count: int
 
 
 def has_images(folder: Path, pattern: re.Pattern[str]) -> bool:
-    """Whether a folder holds images whose stem matches the pattern."""
+    """Whether a folder contains images whose stem matches the pattern."""
     return any(pattern.fullmatch(entry.stem) and entry.suffix.lower() in IMAGE_SUFFIXES for entry in visible(folder))
 
 
