@@ -30,7 +30,7 @@ def find_plane(
     sigma_z: np.ndarray | None = None,
     start: Plane | None = None,
 ) -> tuple[Plane, np.ndarray]:
-    """The plane that holds most pixels of a cloud ``(h, w, 3)``, and its region ``(h, w)`` bool.
+    """Detect the plane with most pixels of a cloud ``(h, w, 3)``, and its region ``(h, w)`` bool.
 
     ``mask`` leaves only some pixels to search in; ``sigma_z`` ``(h, w)`` mm is the expected noise. The region is one
     patch without its outermost two pixels; isolated pixels and small holes inside it belong to it, whether something
@@ -51,7 +51,7 @@ def find_sphere(
     radius: float | None = None,
     start: Sphere | None = None,
 ) -> tuple[Sphere, np.ndarray]:
-    """The sphere that holds most pixels, and its region, as ``find_plane``; ``radius`` in mm narrows the search."""
+    """Detect the sphere with most pixels, and its region, as ``find_plane``; ``radius`` in mm narrows the search."""
     measured = measured_pixels(points, mask)
     noise = _typical_noise(sigma_z, measured)
 
@@ -77,7 +77,7 @@ def find_spheres(
 
 
 def start_plane(points: np.ndarray, mask: np.ndarray, sigma_z: np.ndarray | None = None) -> Plane:
-    """The plane that most points under ``mask`` agree with."""
+    """Estimate the plane that most points under ``mask`` agree with, by RANSAC."""
     measured = measured_pixels(points, mask)
     return ransac_plane(
         sample_points(points, measured), max(RANSAC_TOLERANCE_MM, 2.0 * _typical_noise(sigma_z, measured))
@@ -87,7 +87,7 @@ def start_plane(points: np.ndarray, mask: np.ndarray, sigma_z: np.ndarray | None
 def start_sphere(
     points: np.ndarray, mask: np.ndarray, sigma_z: np.ndarray | None = None, radius: float | None = None
 ) -> Sphere:
-    """The sphere that most points under ``mask`` agree with."""
+    """Estimate the sphere that most points under ``mask`` agree with, by RANSAC."""
     measured = measured_pixels(points, mask)
     tolerance = max(RANSAC_TOLERANCE_MM, 2.0 * _typical_noise(sigma_z, measured))
     return ransac_sphere(sample_points(points, measured), tolerance, radius)[0]

@@ -28,7 +28,7 @@ def evaluate_sphere(
     radius: float | None = None,
     start: Sphere | None = None,
 ) -> SphereResult:
-    """The sphere in a cloud ``(h, w, 3)`` mm, NaN where invalid, and the radial distances from it.
+    """Fit a sphere to a cloud ``(h, w, 3)`` mm, NaN where invalid, and measure the radial distances from it.
 
     ``mask`` ``(h, w)``: the pixels that show the sphere; None: the largest round patch is found. ``sigma_z`` ``(h, w)``
     mm: the expected noise of z. ``radius`` in mm, roughly, helps to find the sphere; the fitted radius stays free, as

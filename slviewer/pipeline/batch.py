@@ -145,7 +145,7 @@ def batch(
 def _run_tasks(
     client: Any, wanted: Sequence[tuple[str, str]], task: Task, progress: Progress, warn: Warn
 ) -> tuple[TaskResult, ...]:
-    """The result of the task for each (session, capture), in their order."""
+    """Run the task for each (session, capture); return the results in their order."""
     outcomes = _gather_results(client, {(a, name): (run_task, a, name, task) for a, name in wanted}, progress, warn)
     done = tuple(
         came if isinstance(came, TaskResult) else TaskResult(a, name, failed=came)
@@ -168,7 +168,7 @@ def _write_verifications(client: Any, done: Sequence[TaskResult], task: Task, wa
 
 @contextmanager
 def _connect(scheduler: str) -> Iterator[Any]:
-    """A client of a scheduler that runs already, and has a worker."""
+    """Yield a client of a running scheduler that has a worker. Raises SlviewerError otherwise."""
     _check_installed()
     from distributed import Client
 
@@ -191,7 +191,7 @@ def _connect(scheduler: str) -> Iterator[Any]:
 
 @contextmanager
 def _start_cluster() -> Iterator[Any]:
-    """A client of worker processes on this machine, as many as cores and memory allow, which end with it."""
+    """Yield a client of new worker processes on this machine, as many as cores and memory allow."""
     _check_installed()
     import dask.config
     from dask.system import CPU_COUNT
@@ -258,7 +258,7 @@ def _gather_results(
 
 
 def _result_or_error(future: Any) -> Any:
-    """The result of a finished future, or the reason as text where the worker could not compute it."""
+    """Return the result of a finished future, or the reason as text where the worker could not compute it."""
     from concurrent.futures import CancelledError
 
     from distributed import KilledWorker

@@ -26,7 +26,7 @@ def absolute_address(session: Path | str) -> str:
 
 @contextmanager
 def fetch_session(address: str, capture: str = "") -> Iterator[Path]:
-    """A folder with the session, in which the named capture has its frames; raises SessionError where it is missing.
+    """Yield a folder with the session and the named capture's frames. Raises SessionError where it is missing.
 
     From an fsspec address it is copied, with the calibrations, and removed when the block ends.
     """
@@ -59,7 +59,7 @@ def fetch_session(address: str, capture: str = "") -> Iterator[Path]:
 
 @contextmanager
 def export_folder(address: str, batch: str) -> Iterator[Path]:
-    """A folder whose files appear in the session's exports when the block ends, each whole, and none if it fails.
+    """Yield a folder whose files are moved to the session's exports when the block ends; none if it fails.
 
     They replace files of their names. ``remove_leftovers`` removes what a killed worker leaves behind.
     """

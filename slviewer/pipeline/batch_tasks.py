@@ -147,7 +147,7 @@ def _verify(store: Session, capture: str, task: Task, warnings: list[str]) -> Ta
 
 
 def _without_maps(verification: Verification) -> Verification:
-    """A copy with the figures that its JSON needs, without the arrays of one value per pixel."""
+    """Return a copy with the figures for its JSON, without the arrays of one value per pixel."""
     none = np.zeros((0, 0), bool)
     captures = {
         name: replace(

@@ -251,7 +251,7 @@ def _fit_models(
     warn: Warn,
     excluded: Container[str] = (),
 ) -> CalibrationResult:
-    """The models that follow from a stereo calibration that was not rejected, with the verdict on all of them.
+    """Fit the models that follow from an accepted stereo calibration; return them with the verdict on all.
 
     Warns of poses that were excluded, but for those ``excluded`` before, and of what is doubtful.
     """
@@ -286,7 +286,7 @@ def _reasons_to_exclude(names: Sequence[str], poses: Sequence[str], exclude: Seq
 def _fit_after_stereo(
     models: Sequence[str], stereo: StereoModel, observations: Sequence[Observation], progress: Progress, warn: Warn
 ) -> CalibrationResult:
-    """The models that follow from stereo; one that cannot be fitted is a warning, and stops no other."""
+    """Fit the models that follow from stereo; one that cannot be fitted is a warning, and stops no other."""
 
     def fit(name: str, calibrate_model: Fit[M], start: float, end: float, doing: str) -> M | None:
         """Fit one model if it is requested; None, with a warning, where it cannot be fitted."""

@@ -65,7 +65,7 @@ def calibrate_poses_with_evidence(
 
 
 def describe_period_conflict(sequence: PatternSequence) -> str:
-    """Why the fringe periods and the Gray code of a sequence cannot be combined; empty where they can."""
+    """Describe why the fringe periods and the Gray code of a sequence conflict; empty where they do not."""
     for axis in sequence.axes:
         if sequence.periods_px(axis) and sequence.find("gray", axis):
             try:
@@ -88,14 +88,14 @@ def save_verdict(store: Session, verdict: Verdict, poses: Sequence[str]) -> None
 
 
 def load_last_verdict(store: Session) -> Verdict | None:
-    """The verdict on the last attempt to calibrate, also a failed one; None before the first."""
+    """Load the verdict on the last attempt to calibrate, also a failed one; None before the first."""
     if not store.has_result(VERDICT):
         return None
     return from_plain(store.load_result(VERDICT, only=())[0]["verdict"], Verdict)
 
 
 def rejection_error(verdict: Verdict, is_saved: bool) -> CalibrationRejected:
-    """The error to raise for a rejected calibration; ``is_saved``: the session holds it for inspection."""
+    """Return the error to raise for a rejected calibration; ``is_saved``: the session holds it for inspection."""
     first, more = verdict.findings[0], len(verdict.findings) - 1
     others = f" (and {more} more finding{'s' * (more != 1)})" if more else ""
     saved_note = "; the calibration is saved for inspection, and not used" if is_saved else ""

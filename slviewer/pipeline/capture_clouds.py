@@ -41,7 +41,7 @@ def capture_cloud(
     accept_rejected: bool = False,
     warn: Warn = ignore_warnings,
 ) -> Cloud:
-    """The organised cloud of a decoded capture, with the scale that was applied to the calibration.
+    """Reconstruct the organised cloud of a decoded capture, with the scale of its calibration applied.
 
     Raises InputError where capture and calibration do not belong together: by their sizes, or by how far the axes of
     the capture miss each other, which is a warning if ``accept_rejected``. Where they miss each other by more than

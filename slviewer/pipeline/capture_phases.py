@@ -41,7 +41,7 @@ _REASONS = {
 def decode_capture(
     capture: Capture, frames: np.ndarray | None = None, *, relative: bool = False
 ) -> dict[Axis, PhaseMap]:
-    """The absolute phase of every axis that a capture holds.
+    """Decode the absolute phase of every axis of a capture.
 
     Raises InputError for a phase that is not absolute, unless a ``relative`` one will do.
     """
@@ -59,7 +59,7 @@ def decode_capture(
 
 
 def decode_frames(name: str, sequence: PatternSequence, frames: np.ndarray) -> dict[Axis, PhaseMap]:
-    """The phase of every axis, absolute or not; errors name the capture."""
+    """Decode the phase of every axis, absolute or not; errors name the capture."""
     try:
         light = estimate_frame_light(sequence, frames)
         return {axis: decode(sequence, frames, axis, light) for axis in sequence.axes}
@@ -165,12 +165,12 @@ def capture_texture(capture: Capture, frames: np.ndarray) -> np.ndarray:
 
 
 def texture_8bit(sequence: PatternSequence, frames: np.ndarray) -> np.ndarray:
-    """(h, w) uint8: the scene under white light, from the frames (n, h, w) of a sequence."""
+    """Return the scene under white light (h, w) uint8, from the frames (n, h, w) of a sequence."""
     return convert_to_8bit(texture(sequence, frames))
 
 
 def convert_to_8bit(image: np.ndarray) -> np.ndarray:
-    """The image in uint8, its brightest pixel 255 where it has 16 bits."""
+    """Convert an image to uint8, its brightest pixel 255 where it has 16 bits."""
     if image.dtype == np.uint16:
         image = cv2.convertScaleAbs(image, alpha=255.0 / max(int(image.max()), 1))
     return np.ascontiguousarray(image, np.uint8)

@@ -115,7 +115,7 @@ def check(
 
 
 def _drift_reference(store: Session, stereo: StereoModel, capture: str) -> DriftReference:
-    """The drift reference from the calibration's poses except the capture; stored, because it takes many seconds."""
+    """Load or build the drift reference from the calibration's poses except the capture; stored, as it is slow."""
     if store.state_of(REFERENCE) == "fresh" and capture not in stereo.poses:
         return DriftReference.from_arrays(stereo.rig, store.load_result(REFERENCE)[1])
     poses = [name for name in stereo.poses if name != capture]
@@ -127,7 +127,7 @@ def _drift_reference(store: Session, stereo: StereoModel, capture: str) -> Drift
 
 
 def load_drift_history(store: Session) -> tuple[DriftRecord, ...]:
-    """Every drift check that the session remembers, the oldest first."""
+    """Load every drift check of the session, the oldest first."""
     records = []
     for name in numbered_results(store, "drift"):
         values = store.load_result(name, only=())[0]["checked"]

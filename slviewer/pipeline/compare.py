@@ -287,5 +287,5 @@ def _save_comparison(
 
 
 def _safe_name(name: str) -> str:
-    """A name that a file can have on every system."""
+    """Return a file name that is valid on every system: ASCII letters, digits, '-' and '_', 60 at most."""
     return "".join(c if c.isascii() and (c.isalnum() or c in "-_") else "-" for c in name)[:60]

@@ -45,7 +45,7 @@ COLUMNS = ("id", "name", "kind", "scan", "quantity", "value", "unit", "U (k = 2)
 
 
 def add_point(session: SessionLike, on: MeasuredSurface, at: Place, name: str = "") -> Measurement:
-    """A picked point, for relations with what is fitted."""
+    """Save a picked point as a measurement, to relate it with fits."""
     feature, spread = on.picked(at)
     x, y, z = (Quantity(axis, float(value), "mm") for axis, value in zip("xyz", feature.place, strict=True))
     data = {"at": at, "feature": feature, "scatter": spread.scatter, "calibration": on.calibration}
@@ -55,7 +55,7 @@ def add_point(session: SessionLike, on: MeasuredSurface, at: Place, name: str = 
 
 
 def add_distance(session: SessionLike, on: MeasuredSurface, a: Place, b: Place, name: str = "") -> Measurement:
-    """The distance between two picked points."""
+    """Measure and save the distance between two picked points."""
     (first, first_spread), (second, second_spread) = on.picked(a), on.picked(b)
     length = distance(first.place, second.place, first_spread, second_spread)
     data = {"at": [a, b], "ends": [first.place.tolist(), second.place.tolist()]}
@@ -64,7 +64,7 @@ def add_distance(session: SessionLike, on: MeasuredSurface, a: Place, b: Place, 
 
 
 def add_fit(session: SessionLike, on: MeasuredSurface, shape: Shape, region: Region, name: str = "") -> Measurement:
-    """A plane, sphere or cylinder fitted to a region. Raises InputError where the region does not hold it."""
+    """Fit a plane, sphere or cylinder to a region, and save it. Raises InputError where the region has none."""
     fit = fit_feature(shape, on.within(region), on.shared, on.calibration)
     noise = on.noise(region)
     if fit.rms > MAX_RMS_TO_NOISE * noise:
@@ -131,7 +131,7 @@ def add_section(session: SessionLike, on: MeasuredSurface, a: Place, b: Place, n
 
 
 def section_lines(session: SessionLike, identity: str) -> tuple[CutPlane, list[np.ndarray]]:
-    """A saved section's plane, and its lines (k, 2) mm: along, and up."""
+    """Load the plane of a saved section, and its lines (k, 2) mm: along, and up."""
     with opened(session) as store:
         measured = load_measurement(store, identity)
         if measured.kind != "section":
@@ -142,7 +142,7 @@ def section_lines(session: SessionLike, identity: str) -> tuple[CutPlane, list[n
 
 
 def load_measurements(session: SessionLike) -> list[Measurement]:
-    """All measurements, in the order in which they were made; stale where what they were made from has changed."""
+    """Load all measurements, in the order in which they were made; stale where their inputs have changed."""
     with opened(session) as store:
         return [replace(each, stale=_is_stale(store, each)) for each in list_measurements(store)]
 
@@ -166,7 +166,7 @@ def relabel_measurement(session: SessionLike, identity: str, name: str) -> Measu
 
 
 def quantities_of(measured: Measurement) -> list[Quantity]:
-    """The measured quantities with units and uncertainties."""
+    """Return the quantities of a measurement with units and uncertainties."""
     return from_plain(measured.data["quantities"], list[Quantity])
 
 
@@ -216,7 +216,7 @@ def triangulate_surface(on: MeasuredSurface) -> tuple[np.ndarray, np.ndarray]:
 
 
 def load_feature(store: Session, measured: Measurement) -> tuple[Feature, Spread]:
-    """The point, plane, sphere or cylinder of a measurement, and its uncertainty."""
+    """Load the point, plane, sphere or cylinder of a measurement, and its uncertainty."""
     if measured.kind not in ("point", "plane", "sphere", "cylinder"):
         raise InputError(f"{measured.name} is a {measured.kind}: choose a point, plane, sphere or cylinder")
     shared = measurement_arrays(store, measured.id).get("shared")

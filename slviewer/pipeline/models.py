@@ -82,7 +82,7 @@ def save_imported_stereo(
 
 
 def load_stereo(store: Session) -> StereoModel:
-    """The session's stereo calibration, without its residual arrows."""
+    """Load the session's stereo calibration, without its residual arrows."""
     if "stereo" not in available_models(store):
         raise InputError(f"{store.folder} holds no calibration: run `slviewer calibrate` first")
     meta = store.load_result("calibration/stereo", only=())[0]
@@ -101,7 +101,7 @@ def load_stereo(store: Session) -> StereoModel:
 
 
 def load_calibration(session: SessionLike, model: str | None = None, *, accept_rejected: bool = False) -> Model:
-    """The calibration of a session called ``model``; by default the one that the session prefers.
+    """Load the calibration of a session called ``model``; by default the one that the session prefers.
 
     Raises InputError where there is none, CalibrationRejected for one that was rejected, unless that is accepted.
     """
@@ -110,7 +110,7 @@ def load_calibration(session: SessionLike, model: str | None = None, *, accept_r
 
 
 def load_stereo_if_complete(store: Session) -> StereoModel | None:
-    """The session's stereo calibration; None where there is none, or an imported one whose sizes are still unknown."""
+    """Load the session's stereo calibration; None where there is none, or an imported one without sizes."""
     if "stereo" not in available_models(store):
         return None
     meta = store.load_result("calibration/stereo", only=())[0]
@@ -167,7 +167,7 @@ def best_model(store: Session, accept_rejected: bool = False) -> str:
 
 
 def preferred_model(store: Session) -> str:
-    """The calibration that the operator has chosen, while it exists; else ``recommended_model``."""
+    """Return the name of the model that the operator has chosen, while it exists; else ``recommended_model``."""
     decided = store.decision("model")
     return str(decided) if decided and decided in available_models(store) else recommended_model(store)
 
@@ -197,7 +197,7 @@ def load_validation(store: Session) -> CrossValidation | None:
 
 
 def rejection_reason(store: Session) -> str:
-    """Why the session's calibration was rejected; empty where it was not, or was never judged."""
+    """Return why the session's calibration was rejected; empty where it was not, or was never judged."""
     if "stereo" not in available_models(store):
         return ""
     judged = store.load_result("calibration/stereo", only=())[0].get("verdict")

@@ -48,7 +48,7 @@ def opened_or_made(session: SessionLike) -> Iterator[Session]:
 def match_names(
     names: Sequence[str], patterns: Sequence[str], kind: str, error: type[SlviewerError] = UsageError
 ) -> list[str]:
-    """Those of ``names`` that match a pattern such as ``pose_0*``, in their order.
+    """Return those of ``names`` that match a pattern such as ``pose_0*``, in their order.
 
     Raises ``error`` for a pattern that matches none; ``kind``: what they are names of.
     """
@@ -64,5 +64,5 @@ def numbered_results(store: Session, kind: str) -> list[str]:
 
 
 def next_number(store: Session, kind: str) -> int:
-    """The number of the next result of a kind."""
+    """Return the number of the next result of a kind."""
     return 1 + max((int(name.removeprefix(f"{kind}/")) for name in numbered_results(store, kind)), default=0)

@@ -65,7 +65,7 @@ def save_evidence(store: Session, capture: Capture, board: Board, evidence: Pose
 
 
 def load_evidence(store: Session, name: str, board: Board) -> PoseEvidence | None:
-    """The stored evidence of a pose; None where it is missing, or of other frames or another board."""
+    """Load the stored evidence of a pose; None where it is missing, or of other frames or another board."""
     result = f"evidence/{name}"
     if store.state_of(result) != "fresh":
         return None

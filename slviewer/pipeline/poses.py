@@ -41,7 +41,7 @@ def read_pose(
     examine: bool = False,
     check: FrameCheck | None = None,
 ) -> Judged:
-    """The observation of a decoded target pose, or the reason why there is none.
+    """Return the observation of a decoded target pose, or the reason why there is none.
 
     ``texture`` (h, w) or (h, w, 3) uint8 shows the board. ``examine``: with the evidence of its frames (n, h, w).
     ``check``: of its frames; computed if None.
@@ -93,7 +93,7 @@ def read_stored_pose(
 
 
 def load_judged(store: Session, name: str, board: Board, smoothing: Smoothing) -> Judged | None:
-    """The stored reading of a pose; None where it is of other frames, another board or another smoothing."""
+    """Load the stored reading of a pose; None where it is of other frames, another board or another smoothing."""
     result = f"poses/{name}"
     if store.state_of(result) != "fresh":
         return None
@@ -112,7 +112,7 @@ def load_judged(store: Session, name: str, board: Board, smoothing: Smoothing) -
 def read_stored_poses(
     store: Session, names: Sequence[str], board: Board, smoothing: Smoothing, examine: bool = False
 ) -> Iterator[Judged]:
-    """Every pose in order; frames are read only where a pose is not known yet.
+    """Yield every pose in order; frames are read only where no stored result is valid.
 
     ``examine``: each with the evidence of its frames. Raises InputError where poses come from cameras or projectors of
     different size.
@@ -137,7 +137,7 @@ def read_stored_poses(
 
 
 def load_observations(store: Session, names: Sequence[str]) -> list[Observation]:
-    """The stored observations of the named poses."""
+    """Load the stored observations of the named poses."""
     observations = []
     for name in names:
         if store.has_result(f"poses/{name}"):

@@ -169,7 +169,7 @@ def triangulate_points(points: np.ndarray, mask: np.ndarray) -> np.ndarray:
 
 
 def segment_board(store: Session, shot: Capture, texture: np.ndarray, warn: Warn) -> np.ndarray | None:
-    """(h, w) bool: the board's outline in a target pose; None, with a warning, where no board is detected."""
+    """Return the board's region (h, w) bool in a target pose; None, with a warning, where no board is detected."""
     board = load_stereo(store).board
     if not board:
         return None

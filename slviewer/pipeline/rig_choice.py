@@ -83,7 +83,7 @@ def needs_page(choice: Choice) -> bool:
 
 
 def rig_factory(driver: Driver) -> Callable[..., Any] | None:
-    """The function that builds the whole rig of a driver from its options; None if it drives no whole rig."""
+    """Return the function that builds the whole rig of a driver from its options; None if it drives no whole rig."""
     own: dict[str, Callable[..., Any]] = {"simulated": _simulated_setup, "replay": reel}
     return own.get(driver.name, driver.rig)
 

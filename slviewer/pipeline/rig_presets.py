@@ -38,7 +38,7 @@ class Preset:
 
 
 def presets(session: Session | None = None) -> list[Preset]:
-    """The session's own rigs, then those that are shipped; a session's hides a shipped one of the same name."""
+    """List the session's own rigs, then those that are shipped; a session's hides a shipped one of the same name."""
     own = {} if session is None else session.rigs()
     shipped = {path.stem: path for path in sorted(asset_folder(FOLDER).glob("*.toml")) if path.stem not in own}
     return [_read_preset_or_problem(name, path) for name, path in {**own, **shipped}.items()]
@@ -53,7 +53,7 @@ def rigs(session: Session | None = None) -> str:
 
 
 def load_rig(path_or_name: Path | str, session: Session | None = None) -> dict[str, Any]:
-    """The checked choice in a TOML file, or of the preset of that name.
+    """Load the checked choice in a TOML file, or of the preset of that name.
 
     Raises InputError for a file or a name that does not exist, an unknown key or driver, DeviceError where a package is
     missing.

@@ -41,7 +41,7 @@ def describe_scale(store: Session, model: str) -> str:
 
 
 def scale_cloud(cloud: Cloud, factor: float) -> Cloud:
-    """The cloud, larger by a factor, its noise with it."""
+    """Return the cloud enlarged by a factor, with its noise."""
     if factor == 1.0:
         return cloud
     return replace(

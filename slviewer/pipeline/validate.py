@@ -92,7 +92,7 @@ def cross_validate(
     folds: int = FOLDS,
     progress: Progress = ignore_progress,
 ) -> CrossValidation:
-    """The same for poses that are at hand, with circles at their centres, and the calibration made from all of them."""
+    """Cross-validate models on observations, with circles at their centres, and their stereo calibration."""
     depths = {o.name: float(np.median(_board_depths(o, stereo))) for o in observations}
     parts = split_folds(depths, folds)
     axis = best_axis(observations, stereo)

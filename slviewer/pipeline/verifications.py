@@ -35,7 +35,7 @@ def read_verification(capture: str, meta: Mapping[str, Any], label: str, stale: 
 
 
 def centre_spacings(views: Iterable[VerificationView]) -> list[SpacingRow]:
-    """The distances between the centres of each two spheres by every model that measured both."""
+    """Return the distances between the centres of each two spheres by every model that measured both."""
     spheres = [view for view in views if view.centres_mm and not view.stale]
     return [
         SpacingRow(

@@ -34,7 +34,10 @@ class _Change:
 
 
 def measure_latency(bench: RigUnderTest) -> tuple[Check, float | None]:
-    """The check, and the `settle_ms` that follows from it; fills in the bench's frame time, delay and stale images."""
+    """Measure the delay between projector and camera; return the check and `settle_ms` (None: not measurable).
+
+    Stores frame time, delay and stale images in the bench.
+    """
     if bench.illuminated.mean() < _MIN_ILLUMINATED:
         return Check("latency", "unknown", "The delay cannot be measured: no change of light is visible.", "", {}), None
     begin_s = [bench.grab_timed()[0] for _ in range(6)]

@@ -42,7 +42,7 @@ _SATURATED_FACTOR = 0.5  # the excess of a saturated image is unknown: half of i
 
 
 def check_exposure(bench: RigUnderTest) -> tuple[Check, float | None]:
-    """The check, and the exposure in ms to set instead; None where the present one is right or unknown."""
+    """Check the exposure; return the check and the exposure in ms to set, None where it is right or unknown."""
     level, full = bench.white[bench.illuminated], bench.full
     bright = float(np.quantile(level, 0.995))
     clipped = float(np.mean(level >= 0.985 * full))
@@ -86,7 +86,7 @@ _MAX_FLICKER = 0.02
 
 
 def check_gamma(bench: RigUnderTest) -> tuple[Check, tuple[int, ...] | None, float]:
-    """The check, the table for `PatternSequence.levels`, and the light of grey level 127.5 as a share of white."""
+    """Measure gamma: the check, a table for `PatternSequence.levels`, and the light of level 127.5 over white."""
     where = bench.usable()
     if np.count_nonzero(where) < _MIN_PIXELS:
         text = "The response cannot be measured: too few pixels are illuminated and not saturated."
@@ -130,7 +130,7 @@ _DRIFTS = 0.8
 
 
 def check_ambient(bench: RigUnderTest, last_dark: np.ndarray) -> Check:
-    """The check of ambient light: its level in the dark frames, and whether it changed until the end."""
+    """Check ambient light: its level in the dark frames, and whether it changed until the end."""
     where = bench.illuminated
     ambient = float(np.median(bench.dark[where])) / max(bench.contrast, 1e-6)
     step = float(np.median((last_dark - bench.dark)[where])) / max(bench.contrast, 1e-6)
@@ -156,7 +156,7 @@ def check_ambient(bench: RigUnderTest, last_dark: np.ndarray) -> Check:
 
 
 def check_flicker(bench: RigUnderTest, burst: Burst) -> Check:
-    """The check of brightness changes from image to image beyond the noise."""
+    """Check brightness changes from image to image beyond the noise."""
     where, span = bench.usable(), max(bench.contrast, 1e-6)
     if not where.any():
         return Check("flicker", "unknown", "Flicker cannot be measured: all that is illuminated is saturated.", "", {})

@@ -19,7 +19,7 @@ _LAGS = (1, 2, 3)
 
 
 def check_order(bench: RigUnderTest) -> tuple[Check, Check]:
-    """The checks of the order, and of images that are handed out twice."""
+    """Check the order of the images, and whether images are delivered twice."""
     projector = bench.rig.projector.size
     levels = {1: Frame("white"), 0: Frame("black")}
     frames = (

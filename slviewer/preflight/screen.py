@@ -15,7 +15,7 @@ _NOTHING, _LITTLE = 0.01, 0.1  # shares of the image
 
 
 def check_screen(bench: RigUnderTest) -> Check:
-    """The check that the camera sees the projector, switched by a code; stores the illuminated pixels in the rig."""
+    """Check that the camera sees the projector, switched by a code; stores the illuminated pixels in the rig."""
     images = np.stack([bench.grab_mean(255 if on else None, "which screen the camera sees") for on in _CODE])
     code = np.array(_CODE) - np.mean(_CODE)
     images = images - images.mean(axis=0)

@@ -67,7 +67,7 @@ def reconstruct(
     axis: Axis | None = None,
     texture: np.ndarray | None = None,
 ) -> Cloud:
-    """The organised cloud of a capture: points, predicted sigmas and texture on the camera's grid.
+    """Reconstruct the organised cloud of a capture: points, predicted sigmas and texture on the camera's grid.
 
     ``phases``: the capture's absolute phase maps by axis. ``axis``: the one that depth is taken from; None selects the
     one with the smaller median predicted sigma_z over the pixels that both measure, or, where there are none, the one

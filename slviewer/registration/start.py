@@ -47,9 +47,10 @@ def candidates(scan: PreparedScan, reference: PreparedScan, voxel: float) -> Ite
 def rank_starts(
     scanned: PreparedScan, referred: PreparedScan, voxel: float, initial: Candidate | None = None
 ) -> list[Candidate]:
-    """The candidates after a coarse ICP, each pose once, that with the largest part of the scan on the reference first.
+    """Refine the candidates by a coarse ICP, and sort them by the part of the scan on the reference, largest first.
 
-    ICP takes the clouds thinned to ``voxel`` mm. A pose handed in as ``initial`` is the only candidate then.
+    Equal poses are listed once. ICP uses the clouds thinned to ``voxel`` mm. With ``initial``, only this candidate is
+    refined.
     """
     tried = candidates(scanned, referred, voxel) if initial is None else iter([initial])
     scan, reference = scanned.thinned(voxel), referred.thinned(voxel)

@@ -43,7 +43,7 @@ def vary_exposure(light: np.ndarray, rms: float, shot: Shot) -> np.ndarray:
 
 
 def follow_exposure(light: np.ndarray, off: float, shot: Shot) -> np.ndarray:
-    """An exposure control that starts too bright by ``off``; see `exposure_loop_gains`."""
+    """Simulate an exposure control that starts too bright by ``off``; see `exposure_loop_gains`."""
     return scale_frames(light, exposure_loop_gains(light, off))
 
 
@@ -78,7 +78,7 @@ def add_room_flicker(light: np.ndarray, depth: float, shot: Shot) -> np.ndarray:
 
 
 def switch_lamp_on(light: np.ndarray, share: float, shot: Shot) -> np.ndarray:
-    """A lamp switched on half way through the phase steps of x: even light, as a share of the projector's."""
+    """Switch a lamp on half way through the phase steps of x: even light, ``share`` of the projector's."""
     steps = _select_indices(shot, "phase", "x")
     illuminated = light.copy()
     illuminated[steps[len(steps) // 2] :] += np.float32(share) * shot.room_light
@@ -86,7 +86,7 @@ def switch_lamp_on(light: np.ndarray, share: float, shot: Shot) -> np.ndarray:
 
 
 def add_colour_wheel(light: np.ndarray, depth: float, shot: Shot) -> np.ndarray:
-    """A short exposure that sees part of the colour wheel's turn: fast bands of the projector's light alone."""
+    """Simulate a short exposure that sees part of the colour wheel's turn: fast bands of the projector's light."""
     n, height, _ = light.shape
     dark = light.min(0, keepdims=True)
     rows = 5.0 * np.arange(height) / height
@@ -123,7 +123,7 @@ def add_lens_dust(light: np.ndarray, loss: float, shot: Shot) -> np.ndarray:
 
 
 def add_defocus_gradient(light: np.ndarray, sigma_px: float, shot: Shot) -> np.ndarray:
-    """A tilted camera lens: sharp at the left edge, blurred by up to ``sigma_px`` (of 400 px of width) at the right."""
+    """Blur as a tilted lens does: sharp at the left edge, up to ``sigma_px`` (of 400 px of width) at the right."""
     width = light.shape[2]
     widest = sigma_px * width / 400
     steps = 5
@@ -140,21 +140,21 @@ def add_defocus_gradient(light: np.ndarray, sigma_px: float, shot: Shot) -> np.n
 
 
 def encode_srgb(signal: np.ndarray, share: float, shot: Shot) -> np.ndarray:
-    """Video levels instead of light: this share of the way from a straight line to the sRGB curve."""
+    """Encode grey levels by this ``share`` of the sRGB curve, 0 for linear light."""
     x = np.clip(signal / 255, 0, 1)
     curve = np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 1e-9) ** (1 / 2.4) - 0.055)
     return np.asarray(255 * ((1 - share) * x + share * curve), np.float32)
 
 
 def shift_white_balance(signal: np.ndarray, rms: float, shot: Shot) -> np.ndarray:
-    """A digital gain that wanders from frame to frame."""
+    """Apply a digital gain that varies from frame to frame as a random walk of relative ``rms``."""
     walk = np.cumsum(shot.rng.standard_normal(len(signal)))
     walk -= walk.mean()
     return scale_frames(signal, 1 + rms * walk / walk.std())
 
 
 def compress_jpeg(frames: np.ndarray, quality: float, shot: Shot | None = None) -> np.ndarray:
-    """Each frame (n, h, w) uint8 through a JPEG encoder and back."""
+    """Compress each frame (n, h, w) uint8 as JPEG, and decode it."""
     out = np.empty_like(frames)
     for k, frame in enumerate(frames):
         encoded, data = cv2.imencode(".jpg", frame, [cv2.IMWRITE_JPEG_QUALITY, int(quality)])
@@ -164,7 +164,7 @@ def compress_jpeg(frames: np.ndarray, quality: float, shot: Shot | None = None) 
 
 
 def add_hot_pixels(frames: np.ndarray, share: float, shot: Shot) -> np.ndarray:
-    """This share of the pixels hot or dead, the same ones in every capture."""
+    """Set this share of the pixels hot or dead, the same ones in every capture."""
     kind = np.random.default_rng(0x407).random(frames.shape[1:])
     return np.where(kind < share / 2, np.uint8(255), np.where(kind > 1 - share / 2, np.uint8(0), frames))
 
@@ -195,7 +195,7 @@ def _select_indices(shot: Shot, kind: str, axis: str) -> list[int]:
 
 
 def lose_frames(frames: np.ndarray, level: float, shot: Shot) -> np.ndarray:
-    """A Gray frame of y lost (level 0), a phase step of x (1), both (2)."""
+    """Drop a Gray frame of y (level 0), a phase step of x (1), or both (2); later frames move forward."""
     phase_x, gray_y = _select_indices(shot, "phase", "x"), _select_indices(shot, "gray", "y")
     if level == 0:
         return drop_frame(frames, gray_y[2])
@@ -204,7 +204,7 @@ def lose_frames(frames: np.ndarray, level: float, shot: Shot) -> np.ndarray:
 
 
 def repeat_frames(frames: np.ndarray, level: float, shot: Shot) -> np.ndarray:
-    """A Gray frame of x repeated (level 0), a phase step (1), two phase steps and a Gray frame (2)."""
+    """Repeat the previous frame in place of a Gray frame of x (level 0), a phase step (1), or three of them (2)."""
     phase, gray = _select_indices(shot, "phase", "x"), _select_indices(shot, "gray", "x")
     places = {0: [gray[-2]], 1: [phase[2]], 2: [phase[1], phase[-2], gray[-1]]}[int(level)]
     return show_instead(frames, places, [place - 1 for place in places])
@@ -218,7 +218,7 @@ def swap_neighbours(frames: np.ndarray, level: float, shot: Shot) -> np.ndarray:
 
 
 def exchange_axis_frames(frames: np.ndarray, level: float, shot: Shot) -> np.ndarray:
-    """All frames of x and y exchanged (level 0), the phase steps alone (1), the Gray frames alone (2)."""
+    """Exchange all frames of x and y (level 0), the phase steps alone (1), or the Gray frames alone (2)."""
     kinds = {0: get_args(Kind), 1: ("phase",), 2: ("gray", "complementary")}[int(level)]
     x, y = ([i for kind in kinds for i in _select_indices(shot, kind, axis)] for axis in ("x", "y"))
     return show_instead(frames, x + y, y + x)
@@ -235,7 +235,7 @@ def reverse_bits(frames: np.ndarray, level: float, shot: Shot) -> np.ndarray:
 
 
 def reorder_steps(frames: np.ndarray, level: float, shot: Shot) -> np.ndarray:
-    """Phase steps that begin a quarter period late (level 0), run backwards (1), or come as 0 2 4 ... 1 3 5 (2)."""
+    """Reorder phase steps: begin a quarter period late (level 0), run backwards (1), or 0 2 4 ... 1 3 5 (2)."""
     for axis in ("x", "y"):
         places = _select_indices(shot, "phase", axis)
         n = len(places)

@@ -193,7 +193,7 @@ def overexpose(rig: SimulatedRig, times: float, number: int) -> SimulatedRig:
 
 
 def refocus_camera(rig: SimulatedRig, share: float, number: int) -> SimulatedRig:
-    """The camera refocuses for every pose: its focal length changes by up to ``share``."""
+    """Return the rig with the camera refocused for each pose: its focal length changes by up to ``share``."""
     factor = 1 + share * float(np.random.default_rng([rig.seed, number, 0xFB]).uniform(-1, 1))
     fx, fy = rig.camera.focal_px
     return replace(rig, camera=replace(rig.camera, focal_px=(fx * factor, fy * factor)))
@@ -212,7 +212,7 @@ def knock_projector(rig: SimulatedRig, mrad: float, number: int) -> SimulatedRig
 
 
 def flex_board(scene: Scene, bow_mm: float, number: int) -> Scene:
-    """A board that bends anew in each pose."""
+    """Return the scene with a board bent anew for each ``number``; scenes without a board are unchanged."""
     if not isinstance(scene, BoardScene):
         return scene
     bow = bow_mm * np.random.default_rng([number, 0xF1]).uniform(-1, 1, 3)
@@ -220,7 +220,7 @@ def flex_board(scene: Scene, bow_mm: float, number: int) -> Scene:
 
 
 def moving_scenes(scene: Scene, by_mm: float) -> list[Scene]:
-    """A hand that sinks: eleven places, `by_mm` from the first to the last."""
+    """Return eleven copies of a scene that moves by `by_mm` mm and turns slightly, as if held by hand."""
     way, turn = np.array([0.7, 0.5, 0.5]), np.array([0.3, -0.5, 0.2]) / 100
     return [moved_scene(scene, share * by_mm * way, share * by_mm * turn) for share in np.linspace(0, 1, 11)]
 
@@ -257,7 +257,7 @@ def add_second_board(scene: Scene, size_mm: float, number: int) -> Scene:
 
 
 def reverse_pattern(pattern: Pattern, level: float) -> Pattern:
-    """The projector numbers its columns (level 0), rows (1) or both (2) from the other end."""
+    """Reverse the pattern's columns (level 0), rows (1) or both (2)."""
     axis, levels = pattern
     hit = (axis == "x" and level != 1) or (axis == "y" and level != 0)
     return (axis, levels[::-1].copy()) if hit else pattern
