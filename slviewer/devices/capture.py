@@ -124,7 +124,7 @@ def check_exposures(exposures_ms: Sequence[float]) -> list[float]:
 
 
 def _try_capture_texture(rig: Rig) -> np.ndarray | None:
-    """Capture the colour texture; None also on a DeviceError: the frames are complete without it."""
+    """Capture the colour texture (h, w, 3); None also on a DeviceError: the frames are complete without it."""
     with contextlib.suppress(DeviceError):
         return capture_texture(rig)
     return None

@@ -189,7 +189,7 @@ class OpenCVCamera(Openable):
         return self._check_size(following)
 
     def _check_size(self, image: np.ndarray) -> np.ndarray:
-        """Return the image if it has the camera's size and 8 bits. Raises DeviceError otherwise."""
+        """Return the image (h, w) or (h, w, 3) if it has the camera's size and 8 bits. Raises DeviceError otherwise."""
         height, width = image.shape[:2]
         if (width, height) != self.size:
             raise DeviceError(

@@ -151,7 +151,7 @@ class Reader:
         return job.result()
 
     def picture(self, later: int = 0) -> np.ndarray:
-        """Wait for a live source's first picture exposed after this call, or the one `later` pictures after that.
+        """Wait for a live source's first picture (h, w, 3) BGR exposed after this call, or `later` pictures after it.
 
         The delay within an encoder and a network cannot be measured here: the rig measures it and waits for it.
         """

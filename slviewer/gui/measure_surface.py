@@ -153,7 +153,7 @@ def painting(on: MeasuredSurface, colour: str) -> tuple[np.ndarray, np.ndarray, 
 
 
 def _colour_by_deviation(arrays: dict[str, np.ndarray], measured: Measurement) -> tuple[np.ndarray, np.ndarray, Html]:
-    """Colour a surface by a stored deviation, as `painting`; grey where the nominal was not measured."""
+    """Colour a surface by a stored deviation: (points (n, 3) mm, colours (n, 3), legend); grey where not measured."""
     verdict = measured.data["verdict"]
     limit = colour_limit(arrays["signed"], None if verdict is None else float(verdict["tolerance_mm"]))
     uncovered = arrays["uncovered"].reshape(-1, 3)

@@ -66,7 +66,7 @@ def patch(colour: Colour) -> Html:
 
 
 def _colour_surface(surface: Ply, view: str, titles: Sequence[str]) -> tuple[Html, np.ndarray | Colour]:
-    """Return (legend, colours) of a merged surface by texture, scan or uncertainty; grey where not stored."""
+    """Return (legend, colours (n, 3)) of a merged surface by texture, scan or uncertainty; grey where not stored."""
     source, sigma, own = surface.scalars.get("source"), surface.scalars.get("sigma"), surface.colours
     if view == BY_SCAN and source is not None:
         palette = np.array(SCAN_COLOURS, np.uint8)

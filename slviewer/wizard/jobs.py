@@ -71,7 +71,7 @@ class Reporter:
 
     @property
     def has_saved(self) -> bool:
-        """Whether a save has begun since the last report."""
+        """Whether a save has begun since the last report of a share below 1."""
         return self._saving
 
 

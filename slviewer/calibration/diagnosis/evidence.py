@@ -95,7 +95,7 @@ class SolutionEvidence:
 
 @dataclass(frozen=True)
 class Evidence:
-    """All evidence of a calibration.
+    """Evidence of a calibration: of each pose and of the solution.
 
     ``board``: its notation. ``excluded``: poses excluded before the fit, with the reason. ``refusal``: why no
     calibration could be made, or why it was rejected; "" otherwise. ``contradiction``: why the sequence's description

@@ -22,7 +22,7 @@ _GRID = 12  # test pixels along each side of a corner
 
 
 def measure_solution(observations: Sequence[Observation], stereo: StereoModel) -> SolutionEvidence:
-    """Measure the evidence of a stereo calibration; ``observations``: all that it was given, excluded ones included."""
+    """Measure the evidence of a stereo calibration; ``observations``: all, those that the fit excluded too."""
     used = [o for o in observations if o.name in stereo.poses]
     K = stereo.rig.projector.K
     normals = np.array([T[:3, 2] * np.sign(T[2, 2] or 1) for T in stereo.poses.values()])

@@ -68,7 +68,7 @@ def height_at(x, y, frame, heights, terms):
 
 @kernel()
 def _heights(points, frame, heights, out):
-    """Fill the heights (n,) mm of board points."""
+    """Fill ``out`` (n,) mm with the heights of the board's surface at ``points`` (n, 2) mm."""
     terms = np.empty((3, heights.shape[0]))
     for i in range(points.shape[0]):
         out[i], _, _ = height_at(points[i, 0], points[i, 1], frame, heights, terms)
