@@ -2,6 +2,7 @@
 
 import threading
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -28,6 +29,9 @@ VERDICT = "calibration/verdict"
 VALIDATION = "calibration/validation"
 POSES_FOR_PIXELWISE = 8
 """With fewer poses a pixel's own fit is noisier than what it corrects, and stereo is the better default."""
+COMPILED = "compiled/splined"
+COMPILED_VERSION = 1
+"""Of what `SplinedModel.compile_depth` returns."""
 MAX_LOADED = 2
 _LOADED: dict[str, Model] = {}  # by the hash of the saved result
 _LOADED_LOCK = threading.Lock()
@@ -59,7 +63,10 @@ def save_fitted(
 ) -> None:
     """Replace the session's calibration of this kind."""
     meta = {"model": model.to_dict(), "inputs": dict(inputs), "settings": dict(settings)}
-    store.save_result(f"calibration/{model.name}", meta, model.to_arrays())
+    result = f"calibration/{model.name}"
+    store.save_result(result, meta, model.to_arrays())
+    if isinstance(model, SplinedModel):
+        _restore_or_compile(store, model, store.input_hashes(result)[result])
 
 
 def available_models(store: Session) -> tuple[str, ...]:
@@ -127,8 +134,7 @@ def load_residuals(store: Session) -> dict[str, np.ndarray]:
 def load_model(store: Session, name: str) -> Model:
     """One calibration by name.
 
-    The last ``MAX_LOADED`` stay in memory: a splined model compiles its per-pixel maps and its uncertainty when they
-    are first used, which takes seconds.
+    The last ``MAX_LOADED`` stay in memory.
     """
     if name not in available_models(store):
         there = ", ".join(available_models(store))
@@ -151,10 +157,27 @@ def load_model(store: Session, name: str) -> Model:
             f"the {name} calibration in {store.folder} was saved by another version of slviewer: "
             "run `slviewer calibrate` again"
         ) from error
+    if isinstance(model, SplinedModel):
+        _restore_or_compile(store, model, content)
     with _LOADED_LOCK:
         while len(_LOADED) >= MAX_LOADED:
             _LOADED.pop(next(iter(_LOADED)))
         return _LOADED.setdefault(content, model)
+
+
+def _restore_or_compile(store: Session, model: SplinedModel, content: str) -> None:
+    """Load what was compiled from the splined calibration of this hash; else compile and save it, where possible."""
+    if store.has_result(COMPILED):
+        with suppress(SessionError, KeyError):  # damaged: it is compiled again
+            meta, arrays = store.load_result(COMPILED)
+            if meta["inputs"] == {"calibration/splined": content} and meta["version"] == COMPILED_VERSION:
+                model.restore_compiled(meta["compiled"], arrays)
+                return
+    if store.is_writable:
+        compiled, arrays = model.compile_depth()
+        inputs = {"calibration/splined": content}
+        with suppress(SessionError):  # a full disk prevents nothing else
+            store.save_result(COMPILED, {"compiled": compiled, "version": COMPILED_VERSION, "inputs": inputs}, arrays)
 
 
 def best_model(store: Session, accept_rejected: bool = False) -> str:

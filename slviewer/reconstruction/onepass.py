@@ -232,7 +232,7 @@ def _pixelwise(model: PixelwiseModel, axis: Axis, period_px: float) -> kernels.D
 def _splined(model: SplinedModel, axis: Axis, period_px: float) -> kernels.Depths:
     """Return a splined model's compiled coefficients; pixels outside the calibrated region are masked."""
     fast = model.fast_axis(axis)
-    c = np.concatenate([fast.coefficients, model.rays.astype(np.float32)])
+    c = np.concatenate([fast.coefficients, model.single_rays])
     per_mm = (fast.supported_grid.shape[2] - 1) / (fast.far - fast.near)
     bounds = np.empty((2, 0, 0), np.float32)
     return kernels.Depths(

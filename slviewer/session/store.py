@@ -329,9 +329,14 @@ class Session:
             finally:
                 lock.release()
 
+    @property
+    def is_writable(self) -> bool:
+        """Whether the session is open for writing."""
+        return self._lock is not None and self._lock.held
+
     def _require_writer(self) -> None:
         """Raise SessionError unless the session is open for writing and the write is allowed."""
-        if self._lock is None or not self._lock.held:
+        if not self.is_writable:
             raise SessionError(f"{self.folder} is open for reading only: open it with write=True")
         if self._allow is not None:
             self._allow()

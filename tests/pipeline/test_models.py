@@ -6,7 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from slviewer.calibration.splined import model as splined
 from slviewer.errors import InputError, SessionError
+from slviewer.pipeline import models
 from slviewer.pipeline.models import available_models, load_model, preferred_model, warn_if_stale
 from slviewer.session.store import Session
 from slviewer.wizard.operator import Operator
@@ -72,3 +74,46 @@ def test_a_calibration_is_loaded_again_only_when_it_has_changed(recorded: Path, 
         saved = {key: meta[key] for key in ("model", "inputs", "settings")}
         store.save_result(f"calibration/{name}", {**saved, "settings": {"changed": 1}}, dict(arrays))
         assert load_model(store, name) is not first
+
+
+def test_what_a_calibration_compiles_is_saved_and_belongs_to_it_alone(
+    recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = Path(shutil.copytree(recorded / "session", tmp_path / "session"))
+    compiled: list[str] = []
+    for name in ("compile_axis", "compute_sigma_map"):
+        make = getattr(splined, name)
+
+        def count(*args: object, make=make, name=name) -> object:  # type: ignore[no-untyped-def]
+            compiled.append(name)
+            return make(*args)
+
+        monkeypatch.setattr(splined, name, count)
+
+    def load(write: bool = False) -> splined.SplinedModel:
+        models._LOADED.clear()
+        with Session.open(folder, write=write) as store:
+            model = load_model(store, "splined")
+        assert isinstance(model, splined.SplinedModel)
+        return model
+
+    (axis,) = load()._compiled  # saved when the calibration was
+    stored, fresh = load(), splined.SplinedModel(load().bundle)
+    assert compiled == []
+    for name in ("coefficients", "grid", "supported_grid"):
+        np.testing.assert_array_equal(getattr(stored.fast_axis(axis), name), getattr(fresh.fast_axis(axis), name))
+    np.testing.assert_array_equal(stored.sigma_map(axis).nodes, fresh.sigma_map(axis).nodes)
+    np.testing.assert_array_equal(stored.single_rays, fresh.single_rays)
+    assert compiled == ["compile_axis", "compute_sigma_map"]
+
+    with Session.open(folder, write=True) as store:  # another calibration takes nothing of this one
+        meta, arrays = store.load_result("calibration/splined")
+        saved = {key: meta[key] for key in ("model", "inputs", "settings")}
+        store.save_result("calibration/splined", {**saved, "settings": {"changed": 1}}, dict(arrays))
+    assert not load()._compiled  # nothing can be saved where one only reads
+    load(write=True)
+    assert set(load()._compiled) == {axis} and len(compiled) == 4
+
+    (folder / "results" / models.COMPILED / "arrays" / "grid.npy").write_bytes(b"torn")
+    load(write=True)
+    assert set(load()._compiled) == {axis} and len(compiled) == 6

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy.stats import f as fisher
+from scipy.special import fdtrc, fdtri
 
 from slviewer.calibration.drift.reference import DriftReference, PoseChange
 from slviewer.calibration.drift.view import DriftView
@@ -107,8 +107,8 @@ def check_drift(reference: DriftReference, view: DriftView) -> Drift:
     information = np.linalg.inv(C)
     squared_distance = float(estimate.change @ information @ estimate.change)
     degrees = 6 * len(own) - 3  # the floor is itself an estimate, from so many numbers
-    chance = float(fisher.sf(squared_distance / 6, 6, degrees))
-    limit = 6 * float(fisher.isf(FALSE_ALARMS, 6, degrees))
+    chance = float(fdtrc(6, degrees, squared_distance / 6))
+    limit = 6 * float(fdtri(6, degrees, 1 - FALSE_ALARMS))
     scale_sigma = float(np.hypot(np.sqrt(np.mean([a.scale**2 for a in own])), growth))
     two = np.isfinite(estimate.across_px)
     across_sigma = float(np.sqrt(np.nanmean([a.across_px**2 for a in own]))) if two else None

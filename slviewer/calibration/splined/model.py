@@ -16,7 +16,7 @@ from slviewer.calibration.splined.fields import undistort
 from slviewer.calibration.splined.residual_noise import MIN_SIGMA_PX
 from slviewer.calibration.splined.uncertainty import SigmaMap, compute_sigma_map, summarise_volume_sigma
 from slviewer.calibration.splined.unknowns import Arrangement, pinhole_lens
-from slviewer.calibration.splined.volume import is_supported
+from slviewer.calibration.splined.volume import depth_axis, is_supported, working_volume
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import InputError
 from slviewer.fringe.phase import PhaseMap
@@ -85,7 +85,7 @@ class SplinedModel:
         return pixel_rays(self.rig)
 
     @cached_property
-    def _single_rays(self) -> np.ndarray:
+    def single_rays(self) -> np.ndarray:
         """``rays`` in single precision."""
         return self.rays.astype(np.float32)
 
@@ -98,6 +98,27 @@ class SplinedModel:
     def _sigma_maps(self) -> dict[Axis, SigmaMap]:
         """Cache of ``sigma_map``."""
         return {}
+
+    def compile_depth(self) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+        """Compile the axis along which depth is measured, and its uncertainty; `restore_compiled` takes the result."""
+        axis = depth_axis(self.rig, working_volume(self.rig, self.bundle.depth_range_mm))
+        fast, sigma = self.fast_axis(axis), self.sigma_map(axis)
+        data = {"axis": axis, "centre": fast.centre, "step": fast.step, "near": fast.near, "far": fast.far}
+        return data, {
+            "coefficients": fast.coefficients,
+            "grid": fast.grid,
+            "supported_grid": fast.supported_grid,
+            "sigma": sigma.nodes,
+            "rays": self.single_rays,
+        }
+
+    def restore_compiled(self, data: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> None:
+        """Take what `compile_depth` of the same calibration returned, which takes seconds to compute."""
+        axis, depths = data["axis"], (data["near"], data["far"])
+        coefficients, grid, supported_grid = (arrays[name] for name in ("coefficients", "grid", "supported_grid"))
+        self._compiled[axis] = CompiledAxis(coefficients, data["centre"], grid, supported_grid, data["step"], *depths)
+        self._sigma_maps[axis] = SigmaMap(arrays["sigma"], *depths)
+        vars(self)["single_rays"] = arrays["rays"]
 
     def fast_axis(self, axis: Axis) -> CompiledAxis:
         """Return the compiled form of one axis; cached."""
@@ -114,7 +135,7 @@ class SplinedModel:
         """
         self._check(phase)
         px_per_rad = phase.period_px / (2 * np.pi)
-        return self.fast_axis(phase.axis).depth(phase.phase, px_per_rad, self._single_rays, supported)
+        return self.fast_axis(phase.axis).depth(phase.phase, px_per_rad, self.single_rays, supported)
 
     def support(self, phase: PhaseMap) -> np.ndarray:
         """(h, w) bool: measured pixels in cells that target poses illuminated, in camera and projector."""

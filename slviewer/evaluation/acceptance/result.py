@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from slviewer.errors import InputError
 from slviewer.evaluation.acceptance.artefact import Artefact
@@ -163,10 +163,8 @@ def _estimate_scale(artefact: Artefact, positions: Sequence[Position]) -> ScaleE
     name = SIZE if artefact.spacing is None else SPACING
     errors = np.array([f.error_mm for position in positions for f in position.figures if f.property == name])
     n = len(errors)
-    if n > 1:
-        u_mean = float(errors.std(ddof=1) / np.sqrt(n) * student.ppf(0.975, n - 1) / K_95)
-    else:
-        u_mean = positions[0].noise_mm
+    per_deviation = stdtrit(n - 1, 0.975) / K_95 / np.sqrt(n)
+    u_mean = float(errors.std(ddof=1) * per_deviation) if n > 1 else positions[0].noise_mm
     return ScaleEstimate(1e6 * float(errors.mean()) / mm, 1e6 * float(np.hypot(u_mean, u_shared)) / mm, mm, n)
 
 
