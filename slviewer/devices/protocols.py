@@ -133,7 +133,7 @@ class Projector(Protocol):
 class Rig:
     """A camera and a projector that view the same scene, under the name that the operator chose.
 
-    `settle_ms` passes between "shown" and the grab: what was measured of the light's delay beyond the projector's word.
+    `settle_ms` passes between "shown" and the grab: the measured delay of the light after the projector's report.
     """
 
     name: str
