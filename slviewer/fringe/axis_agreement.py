@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import cache, cached_property, lru_cache, partial
 
 import numpy as np
 
@@ -31,6 +31,9 @@ FEWEST_OF_BIT = 10
 MIN_KEPT = 0.15
 """Share of the pixels at which all readable bits are decided; stripes of 6 px and wider leave more than a third."""
 FEWEST_PIXELS = 500
+COARSE_PIXELS = 8_000
+"""Of a sample, that refute most hypotheses: the length of a mean unit vector is known to 0.02."""
+RECENT = 8
 INSIDE = 0.35
 """Of the swing: farther from the middle lies the inside of a stripe. Blurred stripes seen through a gamma of 2.2 lie
 0.28 from the middle."""
@@ -139,21 +142,39 @@ class AxisReader:
     """Reads bits and phases of a sample, each once for all hypotheses."""
 
     def __init__(self, sample: LineSample, indices: list[int]) -> None:
-        swing = sample.swing(indices)
+        chosen = sample.frames[indices] if indices else np.zeros((1, sample.frames.shape[1]), np.float32)
+        high, low = chosen.max(axis=0), chosen.min(axis=0)
+        swing = high - low
         self.illuminated = swing > sample.least_swing
-        indices_illuminated = np.flatnonzero(self.illuminated)
-        self.seen = indices_illuminated
-        self.frames = sample.frames[:, indices_illuminated]
-        self.swing = swing[indices_illuminated]
-        chosen = self.frames[indices] if len(indices_illuminated) else np.zeros((1, 0), np.float32)
-        self.middle = (chosen.max(axis=0) + chosen.min(axis=0)) / 2
-        self.line, self.place = sample.line[indices_illuminated], sample.place[indices_illuminated]
-        self.across = self.line >= sample.rows
-        self._noise, self._least_swing = sample.noise, sample.least_swing
+        self.seen = np.flatnonzero(self.illuminated)
+        self.frames = sample.frames[:, self.seen]
+        self.swing = swing[self.seen]
+        self.middle = (high[self.seen] + low[self.seen]) / 2
+        self.line, self.place = sample.line[self.seen], sample.place[self.seen]
+        self.adjacent = (np.diff(self.place) == 1) & (np.diff(self.line) == 0)
+        self._across = (self.line >= sample.rows)[1:]
+        self._sample, self._indices = sample, indices
         # Each is asked for again by every hypothesis.
         self.bit, self.opposed = cache(self._read_bit), cache(self._measure_opposed)
         self.agreement = cache(partial(_measure_agreement, self))
         self._in_view = cache(self._vary_enough)
+        # Hypotheses that follow each other share the code or the phase: pixels are kept of the last few alone.
+        self.code = lru_cache(RECENT)(partial(_read_checked_code, self))
+        self._wave, self._unwrapped = lru_cache(RECENT)(self._fit_wave), lru_cache(RECENT)(self._unwrap_wave)
+
+    @cached_property
+    def coarse(self) -> "AxisReader":
+        """A reader of some of the pixels, which are no neighbours of each other."""
+        sample = self._sample
+        count = sample.frames.shape[1]
+        some = np.sort(np.random.default_rng(0).permutation(count)[:COARSE_PIXELS])
+        thinned = replace(sample, frames=sample.frames[:, some], line=sample.line[some], place=sample.place[some])
+        return AxisReader(thinned, self._indices)
+
+    @cached_property
+    def gaps(self) -> np.ndarray:
+        """(p,) how many gaps come before each pixel."""
+        return np.concatenate([[0], np.cumsum(~self.adjacent)])
 
     def is_in_view(self, frames: AxisFrames) -> bool:
         """Whether enough pixels vary between the images that are taken to be of this axis."""
@@ -162,8 +183,13 @@ class AxisReader:
 
     def _vary_enough(self, images: frozenset[int]) -> bool:
         """Whether at least ``FEWEST_PIXELS`` pixels vary between these images."""
-        swing = np.ptp(self.frames[sorted(images)], axis=0) if images else np.zeros(0)
-        return bool(np.count_nonzero(swing > self._least_swing) >= FEWEST_PIXELS)
+        rows, count = sorted(images), 0
+        for first in range(0, len(self.swing) if rows else 0, COARSE_PIXELS):
+            swing = np.ptp(self.frames[rows, first : first + COARSE_PIXELS], axis=0)
+            count += int(np.count_nonzero(swing > self._sample.least_swing))
+            if count >= FEWEST_PIXELS:
+                return True
+        return False
 
     def _measure_opposed(self, image: int | None, inverse: int | None) -> float:
         """Share of the pixels inside stripes of both images that are bright in one alone; NaN for few pixels."""
@@ -181,34 +207,55 @@ class AxisReader:
         low = self.middle if inverse is None else self.frames[inverse]
         both = image is not None and inverse is not None
         height = (high - low) * np.float32(0.5 if both else 1.0)
-        noise = self._noise * (0.71 if both else 1.0)
+        noise = self._sample.noise * (0.71 if both else 1.0)
         decided = np.abs(height) > np.maximum(DECIDED * self.swing, DECIDED_SIGMAS * noise)
         value = height > 0
         return value, decided, float(decided.mean()) if decided.size else 0.0, self._mean_stripe_width(value)
 
     def _mean_stripe_width(self, value: np.ndarray) -> float:
         """Mean width in px of stripes, along the rows or the columns, whichever is less."""
-        near = (np.diff(self.place) == 1) & (np.diff(self.line) == 0)
-        edges = (value[1:] != value[:-1]) & near
-        parts = [part for part in (self.across[1:], ~self.across[1:]) if part.any()]
-        return min((np.count_nonzero(part) / (1 + np.count_nonzero(edges & part)) for part in parts), default=0.0)
+        edges = (value[1:] != value[:-1]) & self.adjacent
+        across = int(np.count_nonzero(self._across))
+        edges_across = int(np.count_nonzero(edges & self._across))
+        edges_along = int(np.count_nonzero(edges)) - edges_across
+        parts = ((across, edges_across), (len(self._across) - across, edges_along))
+        return min((pixels / (1 + crossed) for pixels, crossed in parts if pixels), default=0.0)
 
     def phasor(self, images: tuple[int | None, ...], frames: AxisFrames) -> np.ndarray | None:
         """(p,) complex64 modulation e^(i phase); None with fewer than three of the steps."""
-        n = len(images)
+        wave = self._wave(images, frames.gamma)
+        if wave is None:
+            return None
+        turned = np.exp(-1j * frames.offset_rad).astype(np.complex64)
+        return (wave if frames.sign < 0 else np.conj(wave)) * turned
+
+    def unwrapped_phase(self, images: tuple[int | None, ...], frames: AxisFrames) -> np.ndarray:
+        """(p,) phase in rad, unwrapped from pixel to pixel along each line, of steps that have a `phasor`."""
+        return -frames.sign * self._unwrapped(images, frames.gamma)
+
+    def _fit_wave(self, images: tuple[int | None, ...], gamma: float) -> np.ndarray | None:
+        """(p,) complex64: `phasor` for a negative sign, without an offset."""
         steps = [k for k, image in enumerate(images) if image is not None]
         there = [image for image in images if image is not None]
         if len(steps) < 3:
             return None
-        weights = np.linalg.pinv(cosine_columns(np.array(steps), n, 1))[1:].astype(np.float32)
-        levels = self.frames[there]
-        if frames.gamma != 1.0:
+        weights = np.linalg.pinv(cosine_columns(np.array(steps), len(images), 1))[1:].astype(np.float32)
+        consecutive = there == list(range(there[0], there[0] + len(there)))
+        levels = self.frames[there[0] : there[-1] + 1] if consecutive else self.frames[there]
+        if gamma != 1.0:
             dark = self.middle - self.swing / 2
-            levels = np.maximum((levels - dark) / np.maximum(self.swing, 1e-6), 0) ** np.float32(1 / frames.gamma)
+            levels = np.maximum((levels - dark) / np.maximum(self.swing, 1e-6), 0) ** np.float32(1 / gamma)
             levels = levels * self.swing
         cosine, sine = weights @ levels
-        turned = np.exp(-1j * frames.offset_rad).astype(np.complex64)
-        return (cosine - 1j * frames.sign * sine) * turned
+        wave = np.empty(len(cosine), np.complex64)
+        wave.real, wave.imag = cosine, sine
+        return wave
+
+    def _unwrap_wave(self, images: tuple[int | None, ...], gamma: float) -> np.ndarray:
+        """(p,) `unwrapped_phase` for a negative sign."""
+        wave = self._wave(images, gamma)
+        assert wave is not None
+        return np.concatenate([[0.0], np.cumsum(np.angle(wave[1:] * np.conj(wave[:-1])), dtype=np.float64)])
 
 
 def measure_agreement(reader: AxisReader, frames: AxisFrames) -> Agreement:
@@ -216,31 +263,31 @@ def measure_agreement(reader: AxisReader, frames: AxisFrames) -> Agreement:
     return reader.agreement(frames)
 
 
+def measure_code_agreement(reader: AxisReader, frames: AxisFrames) -> Agreement:
+    """The part of `measure_agreement` that the Gray code alone tells; all of what is unknown without one."""
+    if len(reader.swing) < FEWEST_PIXELS or not frames.bits:
+        return Agreement()
+    code, edges, rule = reader.code(frames.bits, frames.inverse, frames.inverted)
+    return Agreement(
+        opposed=_measure_opposition(reader, frames), rule=rule, edges=len(edges.first), unreadable=code.unreadable
+    )
+
+
 def _measure_agreement(reader: AxisReader, frames: AxisFrames) -> Agreement:
     """`measure_agreement` of a hypothesis that is not cached."""
-    result = Agreement()
+    result = measure_code_agreement(reader, frames)
     if len(reader.swing) < FEWEST_PIXELS:
         return result
     if not frames.bits:
         return _measure_level_agreement(reader, frames, result)
-    code = _read_code(reader, frames)
-    rule, edges = _check_code_rule(reader, code)
-    result = replace(
-        result,
-        opposed=_measure_opposition(reader, frames),
-        rule=rule,
-        edges=len(edges.first),
-        unreadable=code.unreadable,
-    )
+    code, edges, _ = reader.code(frames.bits, frames.inverse, frames.inverted)
     if code.known != (1 << code.count) - 1:  # only the bits above the missing one number anything
         missing = code.count - 1 - ((1 << code.count) - 1 - code.known).bit_length() + 1
         bits = tuple(image if b < missing else None for b, image in enumerate(frames.bits))
         inverse = tuple(image if b < missing else None for b, image in enumerate(frames.inverse))
-        code = _read_code(reader, replace(frames, bits=bits, inverse=inverse))
-        _, edges = _check_code_rule(reader, code)
-    phasor = None if frames.fringe is None else reader.phasor(frames.fringe[1], frames)
-    if phasor is not None and len(edges.first) >= FEWEST_EDGES:
-        result = _add_phase_agreement(reader, frames, code, edges, phasor, result)
+        code, edges, _ = reader.code(bits, inverse, frames.inverted)
+    if frames.fringe is not None and len(edges.first) >= FEWEST_EDGES:
+        result = _add_phase_agreement(reader, frames, code, edges, result)
     return _add_coordinate_range(reader, frames, code, result)
 
 
@@ -266,12 +313,23 @@ class _Edges:
     second: np.ndarray
 
 
-def _read_code(reader: AxisReader, frames: AxisFrames) -> _Code:
+def _read_checked_code(
+    reader: AxisReader, bits: tuple[int | None, ...], inverse: tuple[int | None, ...], inverted: bool
+) -> tuple[_Code, _Edges, float]:
+    """The Gray code, its edges, and the share of them that obey its rule."""
+    code = _read_code(reader, bits, inverse, inverted)
+    rule, edges = _check_code_rule(reader, code)
+    return code, edges, rule
+
+
+def _read_code(
+    reader: AxisReader, images: tuple[int | None, ...], inverse: tuple[int | None, ...], inverted: bool
+) -> _Code:  # fmt: skip
     """Read the Gray bits, from the most significant one down to the finest that is readable."""
     bits: list[tuple[np.ndarray, np.ndarray, float, float] | None] = []
-    for b, image in enumerate(frames.bits):
-        inverse = frames.inverse[b] if b < len(frames.inverse) else None
-        bits.append(None if image is None and inverse is None else reader.bit(image, inverse))
+    for b, image in enumerate(images):
+        opposite = inverse[b] if b < len(inverse) else None
+        bits.append(None if image is None and opposite is None else reader.bit(image, opposite))
     readable = [bit is None or _is_readable(bit) for bit in bits]
     count = readable.index(False) if False in readable else len(bits)
     while count and bits[count - 1] is None:
@@ -290,10 +348,11 @@ def _read_code(reader: AxisReader, frames: AxisFrames) -> _Code:
             unreadable = worst if unreadable is None else unreadable
             break
         count = chosen[-1][0]  # stripes that blur has almost closed
-    gray, known = np.zeros(len(decided_pixels), np.int32), 0
+    every, known = np.zeros(len(decided), np.int32), 0
     for b, bit in chosen:
-        gray |= (bit[0][decided_pixels] ^ frames.inverted).astype(np.int32) << (count - 1 - b)
+        every |= bit[0].astype(np.int32) << (count - 1 - b)
         known |= 1 << (count - 1 - b)
+    gray = (every ^ known if inverted else every)[decided_pixels]
     binary = gray.copy()
     shift = 1
     while shift < count:
@@ -338,10 +397,10 @@ def _first_unreadable(
 def _check_code_rule(reader: AxisReader, code: _Code) -> tuple[float, _Edges]:
     """Share of each bit's edges that obey the Gray code, the least of all bits; and the edges that obey."""
     pixels = code.kept
-    near = (np.diff(reader.place[pixels]) <= code.reach) & (np.diff(reader.line[pixels]) == 0)
-    change = (code.gray[1:] ^ code.gray[:-1]) * near
-    at = np.flatnonzero(change)
-    change = change[at]
+    at = np.flatnonzero(code.gray[1:] != code.gray[:-1])
+    first, second = pixels[at], pixels[at + 1]
+    at = at[(reader.place[second] - reader.place[first] <= code.reach) & (reader.line[second] == reader.line[first])]
+    change = code.gray[at] ^ code.gray[at + 1]
     single = (change & (change - 1)) == 0
     below = change - 1  # the bits below the one that changes: 1, 0, 0 ...
     wanted = (change >> 1) & code.known
@@ -360,11 +419,14 @@ def _check_code_rule(reader: AxisReader, code: _Code) -> tuple[float, _Edges]:
 
 
 def _add_phase_agreement(
-    reader: AxisReader, frames: AxisFrames, code: _Code, edges: _Edges, phasor: np.ndarray, result: Agreement
+    reader: AxisReader, frames: AxisFrames, code: _Code, edges: _Edges, result: Agreement
 ) -> Agreement:  # fmt: skip
-    """Complete ``result`` by how the fringes' phase agrees with the edges of the code."""
+    """Complete ``result`` by how the fringes' phase agrees with the edges of the code, where there are fringes."""
     assert frames.fringe is not None
-    turned, gaps = _unwrap_along_lines(reader, phasor)
+    phasor = reader.phasor(frames.fringe[1], frames)
+    if phasor is None:
+        return result
+    turned, gaps = reader.unwrapped_phase(frames.fringe[1], frames), reader.gaps
     first, second = code.kept[edges.first], code.kept[edges.second]
     below, above = phasor[first], phasor[second]
     # Between an edge's pixels, several px apart, a fine fringe turns by more than half a period.
@@ -372,7 +434,7 @@ def _add_phase_agreement(
     step = turned[second] - turned[first]
     angle = np.angle(below) + step / 2
     border = code.binary[edges.second].astype(np.float64)
-    per_cell = _estimate_turns_per_cell(reader, code, edges, phasor)
+    per_cell = _estimate_turns_per_cell(code, edges, turned, gaps)
     cell = frames.cell_of(code.count)
     common, begin = common_phase(angle, border * cell / frames.fringe[0], weight)
     return replace(
@@ -400,17 +462,9 @@ def common_phase(angle: np.ndarray, border_turns: np.ndarray, weight: np.ndarray
     return abs(mean), float((centre / TWO_PI + 0.5) % 1 - 0.5)
 
 
-def _unwrap_along_lines(reader: AxisReader, phasor: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(p,) phase in rad, unwrapped from pixel to pixel along each line; and how many gaps come before each pixel."""
-    adjacent = (np.diff(reader.place) == 1) & (np.diff(reader.line) == 0)
-    steps = np.angle(phasor[1:] * np.conj(phasor[:-1]))
-    angle = np.concatenate([[0.0], np.cumsum(steps, dtype=np.float64)])
-    return angle, np.concatenate([[0], np.cumsum(~adjacent)])
-
-
-def _estimate_turns_per_cell(reader: AxisReader, code: _Code, edges: _Edges, phasor: np.ndarray) -> float:
-    """Fringes between two successive edges of the code along a line, the median."""
-    angle, gaps = _unwrap_along_lines(reader, phasor)
+def _estimate_turns_per_cell(code: _Code, edges: _Edges, angle: np.ndarray, gaps: np.ndarray) -> float:
+    """Fringes between two successive edges of the code along a line, the median; ``angle`` the unwrapped
+    phase, ``gaps`` of the reader."""
     here, there = code.kept[edges.first], code.kept[edges.second]
     order = np.argsort(np.minimum(here, there))
     lower_cell, middle = np.minimum(here, there)[order], ((angle[here] + angle[there]) / 2)[order]
@@ -452,7 +506,7 @@ def estimate_coordinates(reader: AxisReader, frames: AxisFrames) -> np.ndarray:
     if len(reader.swing) == 0:
         return out
     if frames.bits:
-        code = _read_code(reader, frames)
+        code = _read_code(reader, frames.bits, frames.inverse, frames.inverted)
         out[reader.seen[code.kept]] = code.binary * frames.cell_of(code.count) + frames.origin_px
     else:
         levels = _unwrap_levels_of_sample(reader, frames)
