@@ -21,7 +21,7 @@ from slviewer.fringe.contradiction import Contradiction
 from slviewer.fringe.description_change import CLEARLY, LINES, explain_axis
 from slviewer.fringe.frame_light import describe_disturbance, equalize_frames, estimate_frame_light
 from slviewer.fringe.frame_likeness import FrameLikeness
-from slviewer.fringe.frame_order import detect_copies, detect_misplaced_steps, detect_unexplained_steps, search_order
+from slviewer.fringe.frame_order import StepReader, detect_copies, search_order
 from slviewer.fringe.layout import check_stack
 from slviewer.fringe.line_sample import LineSample, coded_frames, grid_sample, sample_lines
 from slviewer.fringe.sequence import Axis, PatternSequence
@@ -121,8 +121,9 @@ def find_contradictions(
         return repeated
     stated = {axis: measure_agreement(readers[axis], described_frames(sequence, axis)) for axis in sequence.axes}
     failed = {axis: failed_tests(described_frames(sequence, axis), stated[axis]) for axis in sequence.axes}
-    disordered = [c for axis in sequence.axes if with_steps for c in detect_misplaced_steps(sequence, axis, sample)]
-    strange = detect_unexplained_steps(sequence, sample) if with_steps and not disordered else set()
+    steps = StepReader(sequence, sample)
+    disordered = [c for axis in sequence.axes if with_steps for c in steps.detect_misplaced_steps(axis)]
+    strange = steps.detect_unexplained_steps() if with_steps and not disordered else set()
     uneven = [i for i in range(len(stack)) if not likeness.is_even(i, i)]
     if not any(failed.values()) and not disordered and not strange and not uneven:
         return _detect_mirroring(sequence, sample)
@@ -134,7 +135,7 @@ def find_contradictions(
     explained = [answers[axis][0].score if answers.get(axis) else sum_shares(stated[axis]) for axis in sequence.axes]
     complete = all(answers.values()) and not disordered and not strange and not uneven
     if not (complete and all(answers[axis][0].is_certain for axis in answers)):
-        order = search_order(sequence, sample, readers, likeness, disordered, strange)
+        order = search_order(sequence, readers, steps, likeness, disordered)
         if order is not None and not (complete and sum(explained) > order.score - CLEARLY):
             return order.contradictions
     out = list(disordered)

@@ -1,54 +1,101 @@
 """An order of the frames in which a capture fits its description: late, missing, repeated and exchanged images."""
 
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cache
 
-from slviewer.fringe.agreement_tests import Answer, failed_tests, is_supported, sum_shares
-from slviewer.fringe.axis_agreement import AxisFrames, AxisReader, described_frames, measure_agreement
+from slviewer.fringe.agreement_tests import SURE, Answer, failed_tests, is_supported, sum_shares
+from slviewer.fringe.axis_agreement import (
+    AxisFrames,
+    AxisReader,
+    described_frames,
+    measure_agreement,
+    measure_code_agreement,
+)
 from slviewer.fringe.contradiction import Contradiction
 from slviewer.fringe.frame_likeness import FrameLikeness
 from slviewer.fringe.ghost import detect_ghosting
 from slviewer.fringe.layout import Shift
 from slviewer.fringe.line_sample import LineSample
-from slviewer.fringe.residual_order import detect_foreign_frames, detect_misordered_steps, recover_step_order
-from slviewer.fringe.residual_sample import Fringe, sample_fringe
+from slviewer.fringe.residual_order import detect_misordered_steps, detect_strange_frames, recover_step_order
+from slviewer.fringe.residual_sample import BESIDE, sample_fringe
 from slviewer.fringe.sequence import Axis, PatternSequence
+from slviewer.fringe.suspect import Suspect
 
 NAMED_BY_STEPS = 0.5
 """What a hypothesis gains that the phase steps name by themselves."""
 
+COARSE_MARGIN = 0.15
+"""By which the lengths of mean unit vectors may differ between a sample and a small part of it."""
+
 Images = tuple[int | None, ...]
 
 
-def detect_misplaced_steps(
-    sequence: PatternSequence, axis: Axis, sample: LineSample, images: Images | None = None
-) -> list[Contradiction]:
-    """Phase steps out of order, by what a cosine through all of them leaves."""
-    out = []
-    causes = {"late": "duplicate-frame", "dropped": "missing-frame", "lag": "frame-lag"}
-    for sampled in _sampled_steps(sequence, axis, sample, images):
-        if steps := recover_step_order(sampled):
-            order = ", ".join(str(step) for step in steps)
-            text = (
-                f"the {len(steps)} phase steps of axis {axis} come in the order {order}: number the frames so in the "
-                "description"
-            )
-            return [Contradiction("step-order", text, axis, None)]
-        for suspect in detect_misordered_steps(sampled):
-            cause = causes.get(suspect.fault, "frame-order")
-            text = f"{suspect.sentence}: put the frames in order, or capture again"
-            out.append(Contradiction(cause, text, axis, float(suspect.frame)))
-    return out
+@dataclass(frozen=True)
+class _StepFindings:
+    """What the phase steps of one period say about their own order; ``strange``: where none is misplaced."""
+
+    order: list[int] | None
+    misplaced: list[Suspect]
+    strange: list[Suspect]
 
 
-def detect_unexplained_steps(sequence: PatternSequence, sample: LineSample, images: Images | None = None) -> set[int]:
-    """Frames that neither a step of their period explains, nor one with a share of the image before it."""
-    unexplained: set[int] = set()
-    for axis in sequence.axes:
-        for sampled in _sampled_steps(sequence, axis, sample, images):
-            if sampled.steps > 3 and not detect_ghosting(sampled):  # else all steps hold a share of the image before
-                unexplained |= {suspect.frame for suspect in detect_foreign_frames(sampled)}
-    return unexplained
+class StepReader:
+    """Compares the phase steps of a sample with a cosine through all of them, once for each order of their images."""
+
+    def __init__(self, sequence: PatternSequence, sample: LineSample) -> None:
+        self._sequence, self._sample = sequence, sample
+        self._cached_findings = cache(self._judge_period)
+
+    def detect_misplaced_steps(self, axis: Axis, images: Images | None = None) -> list[Contradiction]:
+        """Phase steps out of order, by what a cosine through all of them leaves."""
+        out = []
+        causes = {"late": "duplicate-frame", "dropped": "missing-frame", "lag": "frame-lag"}
+        for findings in self._judge_axis(axis, images):
+            if steps := findings.order:
+                order = ", ".join(str(step) for step in steps)
+                text = (
+                    f"the {len(steps)} phase steps of axis {axis} come in the order {order}: number the frames so in "
+                    "the description"
+                )
+                return [Contradiction("step-order", text, axis, None)]
+            for suspect in findings.misplaced:
+                cause = causes.get(suspect.fault, "frame-order")
+                text = f"{suspect.sentence}: put the frames in order, or capture again"
+                out.append(Contradiction(cause, text, axis, float(suspect.frame)))
+        return out
+
+    def detect_unexplained_steps(self, images: Images | None = None) -> set[int]:
+        """Frames that neither a step of their period explains, nor one with a share of the image before it."""
+        findings = (f for axis in self._sequence.axes for f in self._judge_axis(axis, images))
+        return {suspect.frame for each in findings for suspect in each.strange}
+
+    def _judge_axis(self, axis: Axis, images: Images | None) -> Iterator[_StepFindings]:
+        """The findings of each period all of whose steps are there, and see fringes."""
+        count = len(self._sample.lines)
+        images = tuple(range(count)) if images is None else images
+        for period, steps in self._sequence.phase_shifts(axis):
+            if None in (images[i] for i in steps):
+                continue
+            first, last = max(min(steps) - BESIDE, 0), min(max(steps) + BESIDE + 1, count)
+            seen = tuple(i if (image := images[i]) is None else image for i in range(first, last))
+            findings = self._cached_findings(Shift(period, steps), first, seen)
+            if findings is not None:
+                yield findings
+
+    def _judge_period(self, shift: Shift, first: int, seen: tuple[int, ...]) -> _StepFindings | None:
+        """The findings of one period, image ``seen[i]`` in the place of frame ``first + i``; None without fringes."""
+        lines, white = self._sample.lines, self._sample.white
+        images = [*range(first), *seen, *range(first + len(seen), len(lines))]
+        sampled = sample_fringe(lines[images], shift, (0.0, 0.0), white)
+        if sampled is None:
+            return None
+        if order := recover_step_order(sampled):
+            return _StepFindings(order, [], [])
+        misplaced = detect_misordered_steps(sampled)
+        if misplaced or sampled.steps <= 3 or detect_ghosting(sampled):  # all steps hold a share of the image before
+            return _StepFindings(None, misplaced, [])
+        return _StepFindings(None, [], detect_strange_frames(sampled))
 
 
 def detect_copies(
@@ -74,14 +121,13 @@ def _describe_duplicate(sequence: PatternSequence, i: int, j: int) -> Contradict
 
 def search_order(
     sequence: PatternSequence,
-    sample: LineSample,
     readers: dict[Axis, AxisReader],
+    steps: StepReader,
     likeness: FrameLikeness,
     disordered: list[Contradiction],
-    strange: set[int],
 ) -> Answer | None:
     """The order of the frames in which all tests are passed best; None if there is none. ``disordered``: what the phase
-    steps alone say; ``strange``: those that no step explains.
+    steps alone say.
     """
     named_by_steps = {(contradiction.cause, contradiction.value) for contradiction in disordered}
     passed: list[Answer] = []
@@ -94,8 +140,8 @@ def search_order(
             passed.append(Answer((contradiction,), score))
     for i in sorted(range(len(passed)), key=lambda i: -round(passed[i].score / 0.02)):
         images = orders[i]
-        ordered = not any(detect_misplaced_steps(sequence, axis, sample, images) for axis in sequence.axes)
-        if ordered and not detect_unexplained_steps(sequence, sample, images):
+        ordered = not any(steps.detect_misplaced_steps(axis, images) for axis in sequence.axes)
+        if ordered and not steps.detect_unexplained_steps(images):
             (contradiction_found,) = passed[i].contradictions
             k = int(contradiction_found.value or 0)
             if contradiction_found.cause == "duplicate-frame" and (j := likeness.copied(k)) is not None:
@@ -110,9 +156,13 @@ def _score(
     """How well the images agree in this order; None where a test fails, or none has anything to show for itself."""
     if not all(map(likeness.is_even, range(len(images)), images)):
         return None
+    described = {axis: described_frames(sequence, axis, images) for axis in sequence.axes}
+    if any(
+        _is_refuted(readers[axis], frames) and readers[axis].is_in_view(frames) for axis, frames in described.items()
+    ):
+        return None
     score, sure = 0.0, False
-    for axis in sequence.axes:
-        frames = described_frames(sequence, axis, images)
+    for axis, frames in described.items():
         a = measure_agreement(readers[axis], frames)
         if failed_tests(frames, a) or not (is_supported(frames, a) or _lacks_steps(frames)):
             if readers[axis].is_in_view(frames):
@@ -121,6 +171,15 @@ def _score(
         sure |= is_supported(frames, a)
         score += sum_shares(a)
     return score if sure else None
+
+
+def _is_refuted(reader: AxisReader, frames: AxisFrames) -> bool:
+    """Whether the Gray code alone, or the levels of a small part of the sample, fail a test for certain: at a fraction
+    of the time that all tests take, it is true of most orders."""
+    if frames.bits:
+        a = measure_code_agreement(reader, frames)
+        return bool(failed_tests(frames, a)) or not is_supported(frames, a)
+    return min(measure_agreement(reader.coarse, frames).level_common, default=1.0) < SURE - COARSE_MARGIN
 
 
 def _orders(sequence: PatternSequence) -> Iterator[tuple[Images, Contradiction, float]]:
@@ -160,21 +219,6 @@ def _orders(sequence: PatternSequence) -> Iterator[tuple[Images, Contradiction, 
         images = (*range(k), None, *range(k + 1, n))
         text = f"frame {k + 1} does not show the pattern described for it: look at this image, and capture again"
         yield images, Contradiction("duplicate-frame", text, sequence.frames[k].axis, float(k)), 0.2
-
-
-def _sampled_steps(
-    sequence: PatternSequence, axis: Axis, sample: LineSample, images: Images | None
-) -> Iterator[Fringe]:  # fmt: skip
-    """The fringes of each period all of whose steps are there."""
-    lines = sample.lines
-    if images is not None:
-        lines = lines[[i if image is None else image for i, image in enumerate(images)]]
-    for period, steps in sequence.phase_shifts(axis):
-        if images is not None and None in (images[i] for i in steps):
-            continue
-        sampled = sample_fringe(lines, Shift(period, steps), (0.0, 0.0), sample.white)
-        if sampled is not None:
-            yield sampled
 
 
 def _lacks_steps(frames: AxisFrames) -> bool:

@@ -91,9 +91,12 @@ def recover_step_order(sampled: Fringe) -> list[int] | None:
 
 
 def detect_foreign_frames(sampled: Fringe) -> list[Suspect]:
-    """Frames that no step explains: what is left when order and light have been looked at."""
-    if ghosts := detect_ghosting(sampled):
-        return ghosts
+    """Frames that hold a share of the image before them, or that no step explains."""
+    return detect_ghosting(sampled) or detect_strange_frames(sampled)
+
+
+def detect_strange_frames(sampled: Fringe) -> list[Suspect]:
+    """Frames that no step explains: what remains when order, light and ghosts have been excluded."""
     n = sampled.steps
     products = _choose_products(sampled, _Products(sampled, sampled.frames))
     steps = {k: k for k in range(n)}

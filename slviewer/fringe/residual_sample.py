@@ -11,6 +11,8 @@ PIXELS = 60_000
 """So many are looked at: their statistics are good to half a percent."""
 FEWEST = 500
 """Fewer valid pixels than this say nothing about a frame."""
+BESIDE = 2
+"""So many frames before and after those of a period are compared with them."""
 HIGHEST = 6
 """The highest harmonic of the fringe that gamma is thought to make."""
 _ONE_SIDED = 0.5
@@ -143,8 +145,8 @@ def fit_common_harmonics(frames: np.ndarray, phasor: np.ndarray, own: int) -> np
 
 
 def _neighbours(indices: tuple[int, ...], count: int) -> list[int]:
-    """Frames shown up to two before and after, where these were shown one after the other."""
+    """Frames shown up to ``BESIDE`` before and after, where these were shown one after the other."""
     if indices != tuple(range(indices[0], indices[0] + len(indices))):
         return []
-    around = (indices[0] - 2, indices[0] - 1, indices[-1] + 1, indices[-1] + 2)
-    return [i for i in around if 0 <= i < count]
+    first, last = max(indices[0] - BESIDE, 0), min(indices[-1] + BESIDE + 1, count)
+    return [*range(first, indices[0]), *range(indices[-1] + 1, last)]
