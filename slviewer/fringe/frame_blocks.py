@@ -23,6 +23,8 @@ MAX_COMMON = 0.9
 """Length of the phases' mean unit vector; above it the view would hold a quarter of a period at most."""
 MAX_MISFIT = 0.25
 """Of the amplitude, that a curved response and noise may leave of the steps. Frames of another period leave 0.7."""
+COARSE_PIXELS, COARSE = 4_000, 1.25
+"""Pixels on which images are compared with a cosine first, and the factor by which limits may be exceeded there."""
 DECIDED = 0.3
 """Of half the swing, from which a pixel is on either side of a stripe's edge."""
 READABLE = 0.5
@@ -123,6 +125,9 @@ class BlockReader:
         line, place = sample.line[pixels], sample.place[pixels]
         self.line, self.place, self.across = line, place, line >= sample.rows
         self.adjacent = (np.diff(place) == 1) & (np.diff(line) == 0)
+        some = np.sort(np.random.default_rng(0).permutation(len(pixels))[:COARSE_PIXELS])
+        self._coarse = self.levels[:, some]
+        self._in_middle = np.mean(np.abs(self.levels) < 0.5, axis=1) if len(pixels) else np.zeros(len(self.levels))
 
     @property
     def count(self) -> int:
@@ -131,29 +136,23 @@ class BlockReader:
 
     def phasor(self, images: tuple[int, ...]) -> np.ndarray:
         """(p,) complex64, for a phase that rises with the step."""
-        wave = np.exp(-2j * np.pi * np.arange(len(images)) / len(images)) * (2 / len(images))
-        return np.asarray(wave.astype(np.complex64) @ self.levels[list(images)])
+        return _fit_phasor(self.levels[list(images)])
 
     def run(self, images: tuple[int, ...]) -> PhaseRun | None:
         """The images as all steps of one period; None where they are not."""
-        n = len(images)
-        levels = self.levels[list(images)]
-        mean = levels.mean(axis=0)
-        if float(np.std(mean)) > MAX_SPREAD or float(np.mean(np.abs(levels) < 0.5)) < MIN_MIDDLE:
+        rows = list(images)
+        if float(self._in_middle[rows].mean()) < MIN_MIDDLE or not _is_cosine(self._coarse[rows], COARSE):
             return None
+        levels = self.levels[rows]
         # Three images fit any cosine, also a bit with its inverse and even light.
-        if n == 3 and any(self.are_opposite(a, b) for a, b in combinations(images, 2)):
+        if len(images) == 3 and any(self.are_opposite(a, b) for a, b in combinations(images, 2)):
             return None
-        phasor = self.phasor(images)
-        amplitude = float(np.median(np.abs(phasor)))
-        turned = phasor[None] * np.exp(2j * np.pi * np.arange(n) / n).astype(np.complex64)[:, None]
-        misfit = float(np.sqrt(np.mean((levels - mean - turned.real) ** 2))) / max(amplitude, 1e-6)
-        unit = phasor / np.maximum(np.abs(phasor), 1e-6)
-        if amplitude < DECIDED or misfit > MAX_MISFIT or abs(complex(unit.mean())) > MAX_COMMON:
+        if not _is_cosine(levels):
             return None
+        phasor = _fit_phasor(levels)
         step = np.angle(phasor[1:] * np.conj(phasor[:-1]))
         along, across = (float(np.median(step[self.adjacent & part])) for part in (~self.across[1:], self.across[1:]))
-        return PhaseRun(images, (along, across), misfit)
+        return PhaseRun(images, (along, across), _measure_misfit(levels, phasor))
 
     def bit(self, image: int, inverse: int | None) -> Bit:
         """Measure the stripes of an image, compared with its inverse where there is one."""
@@ -179,6 +178,35 @@ class BlockReader:
         if a.std() < 1e-3 or b.std() < 1e-3:
             return False
         return float(np.corrcoef(a, b)[0, 1]) < OPPOSITE_BLURRED
+
+
+def _is_cosine(levels: np.ndarray, tolerance: float = 1.0) -> bool:
+    """Whether levels (n, p) are n steps of a cosine of many phases, within ``tolerance`` times the limits."""
+    if float(np.std(levels.mean(axis=0))) > MAX_SPREAD * tolerance:
+        return False
+    phasor = _fit_phasor(levels)
+    strength = np.abs(phasor)
+    if float(np.median(strength)) < DECIDED / tolerance or _measure_misfit(levels, phasor) > MAX_MISFIT * tolerance:
+        return False
+    return 1 - abs(complex((phasor / np.maximum(strength, 1e-6)).mean())) >= (1 - MAX_COMMON) / tolerance
+
+
+def _fit_phasor(levels: np.ndarray) -> np.ndarray:
+    """(p,) complex64 of levels (n, p), for a phase that rises with the step."""
+    n = len(levels)
+    angle = 2 * np.pi * np.arange(n) / n
+    cosine, sine = (np.stack([np.cos(angle), np.sin(angle)]) * (2 / n)).astype(np.float32) @ levels
+    phasor = np.empty(len(cosine), np.complex64)
+    phasor.real, phasor.imag = cosine, -sine
+    return phasor
+
+
+def _measure_misfit(levels: np.ndarray, phasor: np.ndarray) -> float:
+    """rms of what a cosine leaves of levels (n, p), in parts of its median amplitude."""
+    angle = 2 * np.pi * np.arange(len(levels)) / len(levels)
+    waves = np.stack([np.cos(angle), -np.sin(angle)], axis=1).astype(np.float32)
+    residual = levels - levels.mean(axis=0) - waves @ np.stack([phasor.real, phasor.imag])
+    return float(np.sqrt(np.mean(residual**2))) / max(float(np.median(np.abs(phasor))), 1e-6)
 
 
 def group_frames(reader: BlockReader) -> FrameBlocks:
