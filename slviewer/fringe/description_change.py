@@ -145,12 +145,16 @@ def _best_cell(frames: AxisFrames, a: Agreement) -> tuple[float, float, float]:
     assert frames.fringe is not None and a.borders is not None
     angle, border, weight = a.borders
     turns = a.turns_per_cell if np.isfinite(a.turns_per_cell) else frames.cell_px / frames.fringe[0]
-    best = (frames.cell_px, 0.0, 0.0)
-    for ratio in np.arange(0.88, 1.121, 0.0005) * turns:
-        common, begin = common_phase(angle, border * ratio, weight)
-        if common > best[1]:
-            best = (float(ratio * frames.fringe[0]), common, begin)
-    return best
+    ratios = np.arange(0.88, 1.121, 0.0005) * turns
+    # From one ratio to the next all unit vectors turn on by the same angles.
+    unit = weight * np.exp(1j * (angle - 2 * np.pi * border * ratios[0]))
+    step = np.exp(2j * np.pi * border * (ratios[0] - ratios[1]))
+    lengths = []
+    for _ in ratios:
+        lengths.append(abs(complex(unit.sum())))
+        unit *= step
+    ratio = ratios[int(np.argmax(lengths))]
+    return (float(ratio * frames.fringe[0]), *common_phase(angle, border * ratio, weight))
 
 
 def _describe_phase_shift(frames: AxisFrames, a: Agreement, late: float, axis: Axis) -> list[Contradiction]:

@@ -174,7 +174,12 @@ def _refined_ratio(fine: np.ndarray, coarse: np.ndarray, rough: float) -> float:
     span = float(np.quantile(angle, 0.99) - np.quantile(angle, 0.01)) / TURN
     reach = min(0.04, 0.4 / (rough * max(span, 0.05)) + 0.01)
     ratios = rough * np.linspace(1 - reach, 1 + reach, 401)
-    lengths = [abs(complex(np.mean(np.exp(1j * (np.angle(fine) - r * angle))))) for r in ratios]
+    # From one ratio to the next all unit vectors turn on by the same angles.
+    unit, step = np.exp(1j * (np.angle(fine) - ratios[0] * angle)), np.exp(1j * (ratios[0] - ratios[1]) * angle)
+    lengths = []
+    for _ in ratios:
+        lengths.append(abs(complex(unit.sum())))
+        unit *= step
     return float(ratios[int(np.argmax(lengths))])
 
 
