@@ -17,11 +17,11 @@ from slviewer.fringe.light_fit import (
     SHARE_PRIOR,
     Fit,
     Light,
-    LightModel,
     Remainder,
     Term,
     equalize_sample,
     fit_light,
+    light_model,
     locate_room_change,
 )
 from slviewer.fringe.light_sample import MIN_PIXELS, LightSample, estimate_albedo, sample_light
@@ -264,7 +264,7 @@ def _few_steps_across(sequence: PatternSequence, k: int) -> int:
 
 def _is_light_varying(sample: LightSample) -> bool:
     """Whether one step of any model, on a small sample, promises enough."""
-    model, count = LightModel(sample), len(sample.frames)
+    model, count = light_model(sample), len(sample.frames)
     if not model.informed:
         return False
     weight = np.ones(sample.frames.shape[1], np.float32)
@@ -280,7 +280,7 @@ def _is_light_varying(sample: LightSample) -> bool:
 def _list_candidate_models(sample: LightSample, gains: Fit) -> Iterator[tuple[tuple[Term, ...], Light]]:
     """The models beside gains alone, each with the light to start from."""
     constant = Light.constant(len(sample.frames))
-    remainder = LightModel(sample).eliminate(gains.light, gains.share, gains.weight)
+    remainder = light_model(sample).eliminate(gains.light, gains.share, gains.weight)
     for terms in MODELS[1:]:
         start = replace(constant, gain=gains.light.gain) if "gain" in terms else constant
         if "wave" in terms:
@@ -363,7 +363,7 @@ def _explains(sample: LightSample, fit: Fit) -> bool:
     """Whether what the light leaves is like noise: little, and as much in one frame as in another."""
     if fit.terms == ("gain",) and not _has_large_gains(sample, fit):
         return False
-    model = LightModel(sample)
+    model = light_model(sample)
     remainder = model.eliminate(fit.light, fit.share, fit.weight)
     energy = (fit.weight * remainder.left**2).sum(axis=1)
     entries = np.full(len(energy), float(fit.weight.sum()))
@@ -382,14 +382,14 @@ def _explains(sample: LightSample, fit: Fit) -> bool:
 
 def _explains_most(sample: LightSample, fit: Fit) -> bool:
     """Whether the light removes a large part of what equal light leaves."""
-    model, one = LightModel(sample), np.ones_like(fit.weight)
+    model, one = light_model(sample), np.ones_like(fit.weight)
     equal = model.eliminate(Light.constant(len(sample.frames)), SHARE_PRIOR[0], one).variance
     return model.eliminate(fit.light, fit.share, one).variance < EXPLAINED * equal
 
 
 def _fill_unknown_frames(sample: LightSample, fit: Fit) -> Fit:
     """The fit, with the gain of the nearest frame, and the room light since its last change, of frames without own."""
-    light, known, used = fit.light, np.array(fit.informed), LightModel(sample).used
+    light, known, used = fit.light, np.array(fit.informed), light_model(sample).used
     frames = np.arange(len(light.gain))
     nearest = known[np.argmin(np.abs(frames[:, None] - known), axis=1)]
     since = np.searchsorted(light.changes, frames, side="right")
@@ -410,7 +410,7 @@ def _estimate_fine_stripes(sample: LightSample, fit: Fit) -> Light:
     Over many fine stripes the mean of each bit and of each inverse is the same share of white: about half, more or less
     by what the camera's curve makes of blurred stripes, which all of them have in common.
     """
-    model, light = LightModel(sample), fit.light
+    model, light = light_model(sample), fit.light
     remainder = model.eliminate(light, fit.share, fit.weight)
     inside = sample.interior.mean(axis=1) if sample.coded else np.zeros(0)
     fine = [i for i, share in zip(sample.coded, inside, strict=True) if share < FINE and i not in fit.informed]

@@ -8,6 +8,7 @@ Gauss-Newton steps (variable projection), with priors where the frames do not de
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
 from typing import Literal
 
 import numpy as np
@@ -97,7 +98,7 @@ def fit_light(
     fixed = weight
     weight = np.ones(sample.frames.shape[1], np.float32) if weight is None else weight
     variance = max(sample.roughness**2, 1 / 12)
-    model = LightModel(sample)
+    model = light_model(sample)
     for _ in range(most_steps):
         remainder = model.eliminate(light, share, weight)
         variance = max(remainder.variance, 1e-3)
@@ -113,7 +114,7 @@ def fit_light(
 
 def locate_room_change(sample: LightSample, light: Light, with_gain: bool, weight: np.ndarray) -> tuple[int, ...]:
     """The frame from which on a change of the room's light, beside gains or alone, explains the most; empty if none."""
-    model = LightModel(sample)
+    model = light_model(sample)
     remainder = model.eliminate(light, SHARE_PRIOR[0], weight)
     normal, moment = remainder.normal_equations(
         light, ("gain", "uniform", "albedo"), max(remainder.variance, 1e-3), SHARE_PRIOR[0]
@@ -145,12 +146,17 @@ def locate_room_change(sample: LightSample, light: Light, with_gain: bool, weigh
 
 def equalize_sample(sample: LightSample, light: Light, used: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
     """(u, p) samples under equal light, and the gains that they were divided by."""
-    cosine, sine = _row_wave(sample, light.cycles)
+    frames = sample.frames[used]
+    gain = np.broadcast_to(light.gain[used, None].astype(np.float32), frames.shape)
     wave = light.wave[used].astype(np.float32)
-    gain = light.gain[used, None].astype(np.float32) * (1 + wave[:, :1] * cosine + wave[:, 1:] * sine)
-    shapes = np.stack([np.ones_like(cosine), sample.column - 0.5, sample.row - 0.5])
-    added = light.uniform[used, None] + (light.albedo[used] @ (shapes * sample.albedo(light.changes)))
-    return ((sample.frames[used] - added.astype(np.float32)) / gain), gain
+    if wave.any():
+        cosine, sine = _row_wave(sample, light.cycles)
+        gain = gain * (1 + wave[:, :1] * cosine + wave[:, 1:] * sine)
+    if light.uniform.any() or light.albedo.any():
+        shapes = np.stack([np.ones_like(sample.column), sample.column - 0.5, sample.row - 0.5])
+        added = light.uniform[used, None] + (light.albedo[used] @ (shapes * sample.albedo(light.changes)))
+        frames = frames - added.astype(np.float32)
+    return frames / gain, gain
 
 
 def _row_wave(sample: LightSample, cycles: float) -> tuple[np.ndarray, np.ndarray]:
@@ -176,6 +182,12 @@ def _moved(light: Light, change: dict[Term, np.ndarray], model: "LightModel") ->
     if "albedo" in change:
         albedo[used] += change["albedo"]
     return replace(light, gain=gain, wave=wave, uniform=uniform, albedo=albedo)
+
+
+@lru_cache(maxsize=2)
+def light_model(sample: LightSample) -> "LightModel":
+    """The model of a sample: one of the coarse sample, and one of the other, serve all fits of a capture."""
+    return LightModel(sample)
 
 
 class LightModel:
@@ -212,6 +224,8 @@ class LightModel:
         is_informed = (sample.interior & sample.bright).sum(
             axis=1
         ) >= least  # dark stripes alone hardly depend on the gain
+        self.classes = [sample.interior & ~sample.bright, sample.interior & sample.bright]
+        self.counts = [members.sum(axis=0).astype(np.float32) for members in self.classes]
         self.informed = (
             *(self.phased[k] for k in self.determined),
             *(i for i, enough in zip(sample.coded, is_informed, strict=True) if enough),
@@ -237,16 +251,13 @@ class LightModel:
                     harmonics += [(place, np.tile(part, (steps, 1))) for part in (wave.real, wave.imag)]
             left[:n] = self.keep.astype(np.float32) @ phases
             shown[:n] = phases - left[:n]
-        inside, bright = sample.interior, sample.bright
-        levels, counts = [], []
-        for members in (inside & ~bright, inside & bright):
-            count = members.sum(axis=0).astype(np.float32)
+        levels = []
+        for members, count in zip(self.classes, self.counts, strict=True):
             level = (frames[n:] * members).sum(axis=0) / np.maximum(count, 1)
             shown[n:] += level * members
             levels.append(level)
-            counts.append(count)
-        left[n:] = (frames[n:] - shown[n:]) * inside
-        return Remainder(self, gain, shown, left, levels, counts, harmonics, share, weight)
+        left[n:] = (frames[n:] - shown[n:]) * sample.interior
+        return Remainder(self, gain, shown, left, levels, self.counts, harmonics, share, weight)
 
 
 @dataclass(eq=False)
@@ -273,10 +284,16 @@ class Remainder:
 
     def scale(self, term: Term) -> float:
         """The unit of a term: 1, or what makes the albedo or 1 the mean grey level."""
-        level = float(np.mean(self.shown[self.shown > 0])) if (self.shown > 0).any() else 1.0
         if term == "uniform":
-            return level
-        return level / max(float(np.mean(self.model.sample.amplitudes[-1])), 1e-3) if term.startswith("albedo") else 1.0
+            return self._mean_level
+        albedo = max(float(np.mean(self.model.sample.amplitudes[-1])), 1e-3)
+        return self._mean_level / albedo if term == "albedo" else 1.0
+
+    @cached_property
+    def _mean_level(self) -> float:
+        """Mean grey level of the entries that show light."""
+        bright = self.shown > 0
+        return float(np.mean(self.shown[bright])) if bright.any() else 1.0
 
     @property
     def freedom(self) -> float:
@@ -350,7 +367,7 @@ class Remainder:
         )
         k, c, p = len(R), u - n, len(self.weight)
         total, at_harmonics = k * u, slice(k * u, k * u + len(self.harmonics))
-        classes = [(~sample.bright & sample.interior, 1 - share), (sample.bright & sample.interior, share)]
+        classes = list(zip(model.classes, (1 - share, share), strict=True))
         # How a frame's change moves the link: through the background, and through the levels of dark and bright.
         reach = np.zeros_like(self.shown)
         reach[model.determined] = 1 / max(len(model.determined), 1)

@@ -242,8 +242,13 @@ def _estimate_room_offsets(levels: list[np.ndarray], modulation: np.ndarray) -> 
     unit = float(np.median(modulation))
     tried = (OFFSETS * unit).astype(np.float32)[:, None]
     best, offsets = np.inf, [0.0] * len(levels)
+    distances = [np.abs(level[some] - tried) for level in levels]
+    buffer = np.empty((len(tried), len(modulation)), np.float32)
     for sharper in SHARPER:
-        misfits = [np.abs(np.abs(level[some] - tried) - sharper * modulation).mean(axis=1) for level in levels]
+        misfits = []
+        for distance in distances:
+            np.subtract(distance, np.float32(sharper) * modulation, out=buffer)
+            misfits.append(np.abs(buffer, out=buffer).mean(axis=1))
         least = [int(np.argmin(misfit + 1e-3 * np.abs(tried[:, 0]))) for misfit in misfits]
         if (total := sum(float(misfit[k]) for misfit, k in zip(misfits, least, strict=True))) < best:
             best, offsets = total, [float(tried[k, 0]) for k in least]

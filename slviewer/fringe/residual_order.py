@@ -157,9 +157,9 @@ class _Products:
 
     def left(self, steps: dict[int, int]) -> tuple[float, int]:
         """Squared grey levels that remain at a pixel when the frames at these places show these steps; and freedom."""
-        rows = [self._index[place] for place in steps]
+        rows = np.array([self._index[place] for place in steps])
         projection, freedom = _residual_projector(tuple(steps.values()), self._n, self._own)
-        return float(np.sum(projection * self._products[np.ix_(rows, rows)])), freedom
+        return float((projection * self._products[rows[:, None], rows]).sum()), freedom
 
     def caused(self, before: dict[int, int], after: dict[int, int]) -> float:
         """What would remain of the fringe alone under `before`, where `after` is true; of the places of both."""

@@ -112,8 +112,9 @@ def fit_cosine(frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Background (p,) float32 and modulation e^(i phase) (p,) complex64, for a positive sign of the phase shift."""
     n = len(frames)
     wave = np.exp(-2j * np.pi * np.arange(n) / n).astype(np.complex64) * np.float32(2 / n)
-    cosine, sine = (np.einsum("k,kp->p", part, frames) for part in (wave.real.copy(), wave.imag.copy()))
-    return frames.mean(axis=0), cosine + 1j * sine
+    phasor = np.empty(frames.shape[1], np.complex64)
+    phasor.real, phasor.imag = np.einsum("wk,kp->wp", np.stack([wave.real, wave.imag]), frames)
+    return frames.mean(axis=0), phasor
 
 
 def fit_common_harmonics(frames: np.ndarray, phasor: np.ndarray, own: int) -> np.ndarray:
@@ -122,25 +123,28 @@ def fit_common_harmonics(frames: np.ndarray, phasor: np.ndarray, own: int) -> np
     Harmonic m of the fringe appears among n steps as the m-th, or as the one that it cannot be told from.
     """
     n = len(frames)
-    k = np.arange(n)
     strength = np.abs(phasor)
     unit = phasor / np.maximum(strength, np.float32(1e-6))
+    powers = {1: unit}
+    for m in range(2, HIGHEST + 1):
+        powers[m] = powers[m - 1] * unit
     added = np.zeros_like(frames)
     for q in range(own + 1, n // 2 + 1):
-        regressors = [strength * unit**m for m in range(2, HIGHEST + 1) if (m - q) % n == 0]
-        regressors += [strength * np.conj(unit**m) for m in range(2, HIGHEST + 1) if (m + q) % n == 0]
+        regressors = [strength * powers[m] for m in range(2, HIGHEST + 1) if (m - q) % n == 0]
+        regressors += [strength * np.conj(powers[m]) for m in range(2, HIGHEST + 1) if (m + q) % n == 0]
         if not regressors:
             continue
-        wave = np.exp(-2j * np.pi * q * k / n).astype(np.complex64)
+        angle = 2 * np.pi * q * np.arange(n) / n
+        waves = np.stack([np.cos(angle), -np.sin(angle)]).astype(np.float32)
         scale = np.float32((1 if 2 * q == n else 2) / n)
-        residual = scale * (
-            np.einsum("k,kp->p", wave.real.copy(), frames) + 1j * np.einsum("k,kp->p", wave.imag.copy(), frames)
-        )
+        residual = np.empty_like(phasor)
+        residual.real, residual.imag = scale * np.einsum("wk,kp->wp", waves, frames)
         design = np.stack(regressors)
         normal, moment = design.conj() @ design.T, design.conj() @ residual
         weights = np.linalg.pinv(normal, rcond=1e-4) @ moment
         common = np.einsum("r,rp->p", weights, design)
-        added += np.real(common * np.conj(wave)[:, None])
+        for wave, part in zip(waves, (common.real.copy(), common.imag.copy()), strict=True):
+            added += wave[:, None] * part
     return added
 
 
