@@ -10,6 +10,7 @@ import pytest
 
 from slviewer.cli import main
 from slviewer.devices.capture import capture
+from slviewer.devices.protocols import Rig
 from slviewer.devices.simulated import simulated_rig
 from slviewer.devices.world import SimulatedWorld
 from slviewer.fringe.guess import guess_sequence
@@ -59,11 +60,16 @@ SEQUENCES = {
 
 
 @cache
-def taken(name: str) -> tuple[PatternSequence, np.ndarray]:
+def rig_before_board() -> Rig:
+    """A simulated rig that sees a board: its rays are traced for the first capture alone."""
     world = SimulatedWorld(letter(0.25, 0))
     world.place("board")
-    rig = simulated_rig(world)
-    sequence = SEQUENCES[name]()
+    return simulated_rig(world)
+
+
+@cache
+def taken(name: str) -> tuple[PatternSequence, np.ndarray]:
+    rig, sequence = rig_before_board(), SEQUENCES[name]()
     with rig.opened():
         frames = np.array(capture(rig, sequence))
     frames.setflags(write=False)

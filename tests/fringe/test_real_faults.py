@@ -53,7 +53,8 @@ def photographed(folder: Path, name: str) -> Capture:
 @cache
 def coordinates(folder: Path, name: str) -> dict[str, np.ndarray]:
     sequence, frames = photographed(folder, name)
-    return {axis: decode(sequence, frames, axis).coordinate for axis in sequence.axes}
+    # A copy, as kernels are compiled anew for arrays that cannot be written.
+    return {axis: decode(sequence, frames.copy(), axis).coordinate for axis in sequence.axes}
 
 
 @pytest.fixture(scope="module")
