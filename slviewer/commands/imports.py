@@ -60,7 +60,7 @@ def run_frames(import_captures: Callable[..., Any], arguments: dict[str, Any]) -
     if source is None or session is None:
         raise UsageError("SOURCE or SESSION is missing: give both, or --guess FOLDER for a TOML")
     if out is not None:
-        raise UsageError("--out is the file for the TOML of --guess: give --guess FOLDER, or leave --out away")
+        raise UsageError("--out is the file for the TOML of --guess: give --guess FOLDER, or omit --out")
     run_import("frames", import_captures, arguments)
 
 
@@ -70,7 +70,7 @@ def run_import_calibration(import_calibration: Callable[..., Any], arguments: di
 
     if arguments["keys"] is None:
         identified = identify_calibration_keys(arguments["file"])
-        print("taken from the file: " + ", ".join(f"{entry} = {key}" for entry, key in identified.items()))
+        print("read from the file: " + ", ".join(f"{entry} = {key}" for entry, key in identified.items()))
     model = call(import_calibration, **arguments)
     if model is None:
         print("stereo calibration imported; import the scans that it belongs to")

@@ -192,7 +192,7 @@ class Reader:
                 )
             if longest_s and now - requested_s > longest_s:
                 raise DeviceError(
-                    f"the pictures of {self._name} come too unevenly to tell new ones from old ones: "
+                    f"the pictures of {self._name} arrive too irregularly to separate new from buffered ones: "
                     "use a cable instead of a radio link, or a lower frame rate"
                 )
             self._condition.wait(0.1)

@@ -82,7 +82,7 @@ class Reconstruction:
         if self.scale:
             lines.append(self.scale)
         if self.masked is not None and self.masked > 0.005:
-            lines.append(f"{100 * self.masked:.1f} % of the pixels are masked: they look where no target pose was")
+            lines.append(f"{100 * self.masked:.1f} % of the pixels are masked: they lie outside the calibrated region")
         if self.board is not None:
             lines += ["inside the board's outline:", self.board.text()]
         return "\n".join(lines)

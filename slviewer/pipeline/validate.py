@@ -63,7 +63,9 @@ def validate(
     with opened(session, write=True) as store:
         stereo = load_stereo(store)
         if not stereo.poses:
-            raise InputError("this calibration was made elsewhere, without target poses to leave out")
+            raise InputError(
+                "this calibration was made elsewhere, without target poses: calibrate here to cross-validate"
+            )
         names = [name for name in MODELS if name in (models or available_models(store))]
         if not names:
             raise UsageError(f"no model is called {', '.join(models)}: use {', '.join(MODELS)}")

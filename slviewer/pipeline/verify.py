@@ -67,8 +67,8 @@ class Verification:
             blocks.append(f"distances between the centres:\n{render(table)}")
         for name, shares in self.masked.items():
             blocks += [
-                f"{name}: {model} leaves out {100 * share:.1f} % of the shape's pixels, which look where no target "
-                "pose was"
+                f"{name}: {model} masks {100 * share:.1f} % of the shape's pixels: they lie outside the calibrated "
+                "region"
                 for model, share in shares.items()
                 if share > 0.005
             ]

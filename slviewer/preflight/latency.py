@@ -84,11 +84,11 @@ def measure_latency(bench: RigUnderTest) -> tuple[Check, float | None]:
             settle,
         )
     if settle == 0:
-        sentence = "Light arrives as soon as the projector says so: the first image after each change is right."
+        sentence = "Light arrives as soon as the projector reports it: the first image after each change is right."
     else:
         sentence = (
             f"Light arrives up to {max(fresh):.0f} ms ({max(fresh) / bench.frame_ms:.1f} camera frames) after the "
-            f"projector's word; captures wait {settle:g} ms."
+            f"projector reports the image as shown; captures wait {settle:g} ms."
         )
     long = settle > _LONG_MS
     remedy = "Switch the projector's picture processing off (game mode), so that captures are quicker." if long else ""

@@ -127,7 +127,7 @@ def _check_arrays(name: str, points: np.ndarray, normals: np.ndarray | None) -> 
     if len(points) < LEAST_POINTS:
         raise InputError(f"The {name} has {len(points)} points: at least {LEAST_POINTS} are needed to align it.")
     if not np.isfinite(points).all():
-        raise InputError(f"The {name} holds points that are not finite: leave out its invalid pixels first.")
+        raise InputError(f"The {name} holds points that are not finite: exclude its invalid pixels first.")
     if normals is not None and normals.shape != points.shape:
         raise InputError(f"The {name} has {len(points)} points and normals of shape {normals.shape}: give one each.")
 

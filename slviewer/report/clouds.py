@@ -59,7 +59,7 @@ def draw_clouds(views: Sequence[CloudView]) -> Figure:
         ax.set_axis_off()
     return finish_figure(
         drawing,
-        "Each scan as measured, seen from above and aside, lit by its own surface normals and coloured by depth.",
+        "Each scan as measured, seen from above and aside, shaded by its own surface normals and coloured by depth.",
         "Shaded views of " + ", ".join(f"{view.name} ({_format_count(view)})" for view in views),
     )
 

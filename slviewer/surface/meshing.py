@@ -100,12 +100,12 @@ class BuiltMesh:
         """Describe the mesh for the terminal."""
         lines = [f"{len(self.mesh.faces)} triangles by {self.method}, points {self.cell_mm:.2f} mm apart"]
         if self.dropped.parts:
-            lines.append(f"{self.dropped.parts} floating parts left out, up to {self.dropped.largest_mm2:.1f} mm2")
+            lines.append(f"{self.dropped.parts} floating parts removed, up to {self.dropped.largest_mm2:.1f} mm2")
         for done, holes in ((self.trimmed, "filled"), (self.filled, "holes")):
             if done is not None and (n := getattr(done, holes)):
                 lines.append(f"{n} hole{'s' * (n > 1)} filled, up to {done.largest_mm:.1f} mm across")
         if self.trimmed is not None and (n := self.trimmed.flattened):
-            lines.append(f"{n} of them laid flat, for the surface bulged there")
+            lines.append(f"{n} of them filled flat, because the surface bulged there")
         if self.trimmed is not None and self.trimmed.imagined:
             lines.append(f"{100 * self.trimmed.imagined:.1f} % of the surface was not measured: it closes those holes")
         for what, change in (("smoothing", self.smoothed), ("thinning", self.thinned)):

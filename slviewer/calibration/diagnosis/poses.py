@@ -101,7 +101,7 @@ def diagnose_single_poses(e: Evidence) -> Iterator[Finding]:
 
 _REMEDIES: dict[Cause, str] = {
     "board-numbering": "uncover the whole board, and capture the pose again",
-    "moved": "hold the board still until all frames are taken, and capture the pose again",
+    "moved": "hold the board still until all frames are captured, and capture the pose again",
     "outlier": "look at its picture, and capture the pose again",
 }
 
