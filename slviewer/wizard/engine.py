@@ -111,12 +111,15 @@ class Engine:
         """Open another session, with `rig`, else the one that it remembers, else the one in use.
 
         Jobs of the previous session are cancelled. If the remembered rig is not connected, the session opens without.
+        Where the session is open already, only the rig changes.
         """
         with self.lock:
             if not self.acquisition.idle:
                 raise InputError("a capture is running: wait for it, or cancel it, before you open another session")
             before = self.session
-            if before is not None and Path(path).expanduser().absolute() == before.folder:
+            if before is not None and Path(path).expanduser().resolve() == before.folder.resolve():
+                if rig:
+                    self._restore_rig(before, rig)
                 return
             store = Session.open_or_create(path)
             self.acquisition.stop_stream()

@@ -114,6 +114,19 @@ def test_sessions_of_one_rig_have_exposures_of_their_own(operator: Operator, tmp
     assert operator.wait_for(lambda s: s.rig.exposure_ms == 3.0, 5.0)
 
 
+def test_an_open_session_can_be_opened_again_by_any_path_and_with_another_rig(
+    operator: Operator, tmp_path: Path
+) -> None:
+    (tmp_path / "link").symlink_to(tmp_path / "session")
+    (tmp_path / "inner").mkdir()
+    store = operator.session
+    assert operator.open_session(tmp_path / "link") and operator.open_session(tmp_path / "inner" / ".." / "session")
+    assert operator.session is store
+    assert operator.open_session(tmp_path / "link", {**RIG, "exposure_ms": 1.5})
+    assert operator.session is store and store is not None and store.decision("rig")["exposure_ms"] == 1.5
+    assert operator.wait_for(lambda s: s.rig.exposure_ms == 1.5, 5.0)
+
+
 def test_a_recording_is_not_asked_for_light_that_it_does_not_hold(operator: Operator, tmp_path: Path) -> None:
     capture(tmp_path / "recorded", "a", RIG, patterns="p18")
     assert operator.set_light("pattern") and operator.wait_for(lambda s: s.rig.light == "pattern", 5.0)
