@@ -4,7 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slviewer.fringe.axis_agreement import FEWEST_EDGES, Agreement, AxisFrames
+from slviewer.fringe.axis_agreement import FEWEST_EDGES, Agreement
+from slviewer.fringe.axis_reader import AxisFrames
 from slviewer.fringe.contradiction import Contradiction
 
 MIN_RULE, MIN_COMMON, MIN_RISING = 0.5, 0.5, 0.5

@@ -17,16 +17,8 @@ from slviewer.fringe.agreement_tests import (
     sum_shares,
     wrap,
 )
-from slviewer.fringe.axis_agreement import (
-    FEWEST_EDGES,
-    Agreement,
-    AxisFrames,
-    AxisReader,
-    common_phase,
-    described_frames,
-    measure_agreement,
-    reversed_bits,
-)
+from slviewer.fringe.axis_agreement import FEWEST_EDGES, Agreement, common_phase, measure_agreement
+from slviewer.fringe.axis_reader import AxisFrames, AxisReader, described_frames, reversed_bits
 from slviewer.fringe.contradiction import Contradiction
 from slviewer.fringe.sequence import Axis, PatternSequence
 

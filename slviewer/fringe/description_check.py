@@ -10,13 +10,8 @@ from dataclasses import replace
 import numpy as np
 
 from slviewer.fringe.agreement_tests import failed_tests, is_supported, sum_shares
-from slviewer.fringe.axis_agreement import (
-    Agreement,
-    AxisReader,
-    described_frames,
-    estimate_coordinates,
-    measure_agreement,
-)
+from slviewer.fringe.axis_agreement import Agreement, estimate_coordinates, measure_agreement
+from slviewer.fringe.axis_reader import AxisReader, described_frames
 from slviewer.fringe.contradiction import Contradiction
 from slviewer.fringe.description_change import CLEARLY, LINES, explain_axis
 from slviewer.fringe.frame_light import describe_disturbance, equalize_frames, estimate_frame_light

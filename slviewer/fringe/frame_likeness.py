@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from slviewer.fringe.axis_agreement import INSIDE, REACH
+from slviewer.fringe.axis_agreement import REACH
+from slviewer.fringe.axis_reader import INSIDE
 from slviewer.fringe.line_sample import LineSample, coded_frames
 from slviewer.fringe.sequence import Axis, PatternSequence
 

@@ -5,13 +5,8 @@ from dataclasses import dataclass, replace
 from functools import cache
 
 from slviewer.fringe.agreement_tests import SURE, Answer, failed_tests, is_supported, sum_shares
-from slviewer.fringe.axis_agreement import (
-    AxisFrames,
-    AxisReader,
-    described_frames,
-    measure_agreement,
-    measure_code_agreement,
-)
+from slviewer.fringe.axis_agreement import measure_agreement, measure_code_agreement
+from slviewer.fringe.axis_reader import AxisFrames, AxisReader, described_frames
 from slviewer.fringe.contradiction import Contradiction
 from slviewer.fringe.frame_likeness import FrameLikeness
 from slviewer.fringe.ghost import detect_ghosting

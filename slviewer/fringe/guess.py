@@ -8,7 +8,8 @@ import numpy as np
 
 from slviewer.errors import InputError
 from slviewer.fringe.agreement_tests import SURE, failed_tests, is_supported, wrap
-from slviewer.fringe.axis_agreement import Agreement, AxisFrames, AxisReader, described_frames, measure_agreement
+from slviewer.fringe.axis_agreement import Agreement, measure_agreement
+from slviewer.fringe.axis_reader import AxisFrames, AxisReader, described_frames
 from slviewer.fringe.description_check import LEAST_ILLUMINATED, check_description
 from slviewer.fringe.frame_blocks import BlockReader, FrameBlocks, GrayBlock, PhaseRun, group_frames, sample_undescribed
 from slviewer.fringe.line_sample import LineSample, coded_frames

@@ -3,7 +3,8 @@
 import numpy as np
 
 from slviewer.errors import InputError
-from slviewer.fringe.axis_agreement import FEWEST_EDGES, AxisReader, described_frames, measure_agreement
+from slviewer.fringe.axis_agreement import FEWEST_EDGES, measure_agreement
+from slviewer.fringe.axis_reader import AxisReader, described_frames
 from slviewer.fringe.frame_light import equalize_frames, estimate_frame_light
 from slviewer.fringe.layout import axis_layout, check_stack
 from slviewer.fringe.line_sample import coded_frames, sample_lines

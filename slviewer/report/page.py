@@ -40,7 +40,7 @@ class Figure:
     def data(self) -> str:
         """The picture in 64 levels a channel as base64 of a lossless WebP file, half of the PNG's size."""
         levels = np.asarray(self.pixels & 0xFC | self.pixels >> 6, np.uint8)
-        return base64.b64encode(_encode_image(levels, format="WEBP", lossless=True, method=3, quality=50)).decode()
+        return base64.b64encode(_encode_image(levels, format="WEBP", lossless=True, method=1, quality=20)).decode()
 
 
 def _encode_image(pixels: NDArray[np.uint8], **options: Any) -> bytes:
