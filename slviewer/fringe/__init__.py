@@ -1,7 +1,7 @@
-"""What is projected, and what it says.
+"""Pattern sequences, and decoding of the frames that a camera takes of them.
 
-A `sequence.PatternSequence` says which image follows which (`presets` has ready ones, `patterns` renders them);
-`decode.decode` turns the frames that a camera took of it into a `phase.PhaseMap`: absolute phase, modulation,
-background, measured noise, and a reason for every pixel that is masked. `reference` is the definition in NumPy,
-`kernels` the fast way to the same result, `origin` finds the conventions of folders that other tools wrote.
+A `sequence.PatternSequence` describes which image follows which (`presets` has ready-made ones, `patterns` renders
+them); `decode.decode` converts the captured frames to a `phase.PhaseMap`: absolute phase, modulation, background,
+measured noise, and a reason for every pixel that is masked. `reference` is the definition in NumPy, `kernels` the fast
+implementation, `origin` estimates the conventions of captures from other tools.
 """

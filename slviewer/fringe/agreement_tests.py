@@ -1,4 +1,4 @@
-"""The tests that the frames of one axis pass where their description is right."""
+"""Tests that the frames of one axis pass if their description is correct."""
 
 from dataclasses import dataclass
 
@@ -9,32 +9,36 @@ from slviewer.fringe.axis_reader import AxisFrames
 from slviewer.fringe.contradiction import Contradiction
 
 MIN_RULE, MIN_COMMON, MIN_RISING = 0.5, 0.5, 0.5
-"""Shares of the code edges below which the description fails: a wrong one gives no more than chance. Right ones gave
+"""Shares of the code edges below which the description fails: a wrong one gives no more than chance. Correct ones gave
 0.93 and more, also for a cluttered scene in room light."""
 MIN_OPPOSED = 0.8
-"""Share below which a bit and its inverse are none: half of the pixels are alike in images of two other patterns."""
+"""Share below which two images are no bit and inverse: images of other patterns are alike at half of the pixels."""
 SURE = 0.75
-"""Shares that a hypothesis must reach to be named."""
+"""Shares that a hypothesis must exceed to be reported."""
 MIN_LEVEL = 0.4
 """Length of the mean unit vector of the step from one period to the next. Steps that spread evenly give 0, and noise
 that loses every twentieth order 0.5."""
 MAX_BEGIN_TURNS = 0.15
-"""Of a period, by which Gray code and fringes may be apart: decoding allows for so much at the code's edges."""
+"""Largest offset between Gray code and fringes, in periods: the tolerance of decoding at the code's edges."""
 MAX_LEVEL_TURNS = 0.2
-"""Half of what decoding allows for between two periods."""
+"""Largest offset between two periods, in turns: half the tolerance of decoding."""
 SURE_LEVEL = 0.9
-"""Above this length the mean step is known to a hundredth of a period, and half of that is too much."""
+"""Above this length the mean step is accurate to a hundredth of a period, and half of that offset is the limit."""
 MAX_CELL = 0.12
-"""Part of a cell's width: of two periods that differ by less, edges in view would still fall at one phase."""
+"""Relative error of a cell's width: with a smaller one, the edges in view would still have one phase."""
 MAX_OUTSIDE = 0.01
-"""Share of coordinates that may lie beyond the projector, along whose border blur moves a few."""
+"""Largest share of coordinates outside the projector: blur moves a few across its border."""
 CERTAIN = 0.93
 """Shares at which no other hypothesis needs to be tried."""
 
 
 @dataclass(frozen=True)
 class Answer:
-    """Contradictions that explain the frames together, and how well these then agree."""
+    """Contradictions that together explain the frames of an axis, and the agreement that results from them.
+
+    ``score``: sum of the agreement shares, see `sum_shares`. ``is_certain``: whether no other hypothesis needs to be
+    tried.
+    """
 
     contradictions: tuple[Contradiction, ...]
     score: float
@@ -42,22 +46,26 @@ class Answer:
 
 
 def sum_shares(a: Agreement) -> float:
-    """The sum of the shares that tell how well the frames agree; a half for what is not known."""
-    return float(sum(0.5 if np.isnan(share) else share for share in _shares(a)))
+    """Return the sum of the agreement shares (0 to 1 each); an unknown share (NaN) counts as 0.5."""
+    return float(sum(0.5 if np.isnan(share) else share for share in _list_shares(a)))
 
 
-def _shares(a: Agreement) -> list[float]:
-    """Shares (0 to 1) of the tests of an agreement; NaN where a test cannot be made."""
+def _list_shares(a: Agreement) -> list[float]:
+    """Return the agreement shares (0 to 1 each); NaN where a test cannot be made."""
     return [a.opposed, a.rule, a.common, a.rising, *a.level_common]
 
 
 def is_certain(a: Agreement) -> bool:
-    """Whether every known share exceeds ``CERTAIN``."""
-    return all(np.isnan(share) or share > CERTAIN for share in _shares(a))
+    """Return whether every known share exceeds ``CERTAIN``."""
+    return all(np.isnan(share) or share > CERTAIN for share in _list_shares(a))
 
 
 def failed_tests(frames: AxisFrames, a: Agreement) -> set[str]:
-    """The tests that the frames fail; a test that cannot be made is passed."""
+    """Return the names of the tests that the frames fail; a test that cannot be made counts as passed.
+
+    The names are "bits", "inverse", "rule", "common", "begin", "rising", "cell", "levels", "level offset" and
+    "outside".
+    """
     failed = set()
     if a.unreadable is not None:
         failed.add("bits")
@@ -87,7 +95,10 @@ def failed_tests(frames: AxisFrames, a: Agreement) -> set[str]:
 
 
 def is_supported(frames: AxisFrames, a: Agreement) -> bool:
-    """Whether a hypothesis has something to show for itself."""
+    """Return whether the frames give positive evidence for a hypothesis, rather than merely no test against it.
+
+    Every share that can be measured must exceed ``SURE``, and enough code edges, or several periods, must be in view.
+    """
     if frames.bits and not (a.edges >= FEWEST_EDGES and a.rule > SURE):
         return False
     if np.isfinite(a.common) and not (a.common > SURE and a.rising > SURE):
@@ -96,5 +107,5 @@ def is_supported(frames: AxisFrames, a: Agreement) -> bool:
 
 
 def wrap(turns: float) -> float:
-    """-0.5 ... 0.5."""
+    """Wrap a number of periods to the range -0.5 ... 0.5."""
     return float((turns + 0.5) % 1 - 0.5)

@@ -1,13 +1,12 @@
-"""Phase errors that gamma leaves in three and four phase steps: estimated from the frames themselves, and corrected.
+"""Phase errors that gamma causes in three and four phase steps: estimated from the frames themselves, and corrected.
 
 A response that is not linear adds harmonics to the fringe, B_m cos(m theta) with theta the argument of the cosine.
-Among n steps harmonics n - 1 and n + 1 appear as the first, which is measured as
-B_1 e^(i theta) (1 + M cos(n theta) - i d sin(n theta)), with M = (B_{n-1} + B_{n+1}) / B_1 and
-d = (B_{n-1} - B_{n+1}) / B_1. So the modulation ripples with the cosine, and the phase with the sine: the error is
-atan2(-d sin(n theta), 1 + M cos(n theta)). Each is fitted, beside a parabola, to pieces of image lines about one fringe
-long. Texture disturbs the modulation alone and relief the phase alone, and neither follows the fringe, so that gamma is
-what both agree upon. Gamma makes no sine of the modulation and no cosine of the phase: what is fitted to these is the
-part that texture and relief pretend.
+Among n steps harmonics n - 1 and n + 1 appear as the first, which is measured as B_1 e^(i theta) (1 + M cos(n theta) -
+i d sin(n theta)), with M = (B_{n-1} + B_{n+1}) / B_1 and d = (B_{n-1} - B_{n+1}) / B_1. So the modulation ripples with
+the cosine, and the phase with the sine: the error is atan2(-d sin(n theta), 1 + M cos(n theta)). Each is fitted, beside
+a parabola, to pieces of image lines about one fringe long. Texture disturbs the modulation alone and relief the phase
+alone, and neither follows the fringe, so that only gamma affects both alike. Gamma adds no sine to the modulation and
+no cosine to the phase: amplitudes fitted to these are due to texture and relief, and serve as a control.
 """
 
 from dataclasses import dataclass
@@ -20,7 +19,7 @@ from slviewer.fringe.residual_sample import fit_cosine, select_rows
 from slviewer.fringe.suspect import Suspect
 
 MOST_STEPS = 4
-"""From five steps on harmonics below the fourth leave no error, and blur leaves little of the others."""
+"""From five steps on, harmonics below the fourth cause no error, and blur removes most of the others."""
 SIGMAS = 5.0
 """Standard errors beyond which a ripple is no accident: one in two million."""
 CONTROL = 3.0
@@ -28,13 +27,13 @@ CONTROL = 3.0
 NOISE_PART = 0.5
 """An error below this part of the phase noise is neglected: it adds 12 % to it."""
 PIXELS = 40_000
-"""So many are sampled: they tell a ripple of half a thousandth."""
+"""Number of sampled pixels: enough to detect a ripple of half a thousandth."""
 MOST_CYCLES = 0.4
 """Fringes per camera pixel up to which neighbouring phases can be unwrapped."""
 SHORTEST = 16
 """Pixels that a piece has at least, for seven coefficients."""
 BANDS = 6
-"""Parts of the image's height and width, whose means tell how certain the mean of all is."""
+"""Parts of the image's height and width, whose means give the standard error of the mean of all."""
 FEWEST_BLOCKS = 6
 ROUNDS = 6
 """The phase itself is the argument of the ripple: fit and correct in turns, until both settle."""
@@ -44,8 +43,7 @@ OUTLIER = 4.0
 
 @dataclass(frozen=True)
 class AliasedHarmonics:
-    """The ripple of n phase steps: amplitudes ``modulation`` (M, relative) and ``phase`` (d, rad), zero where none is
-    significant.
+    """Ripple of n phase steps: amplitudes ``modulation`` (M, relative) and ``phase`` (d, rad), zero if not significant.
 
     ``is_corrected``: whether d is known well enough to be removed; ``error_rad``: rms error of the phase that remains.
     """
@@ -58,18 +56,18 @@ class AliasedHarmonics:
 
     @property
     def is_significant(self) -> bool:
-        """Whether gamma shows."""
+        """Whether gamma causes a significant ripple."""
         return self.steps > 0
 
     def correction(self, theta: np.ndarray) -> np.ndarray:
-        """rad float32, of theta's shape: what to add to a measured argument ``theta`` of the cosine, rad."""
-        return _correction(theta, self.steps, self.modulation, self.phase).astype(np.float32)
+        """Return the correction, rad float32, to add to the measured argument ``theta`` (rad) of the cosine."""
+        return _compute_correction(theta, self.steps, self.modulation, self.phase).astype(np.float32)
 
 
 def estimate_aliased_harmonics(
     layout: Layout, stack: np.ndarray, white: float, noise: tuple[float, float]
 ) -> AliasedHarmonics:
-    """What harmonics leave in the finest period of an axis; nothing where it has five or more steps.
+    """Estimate the ripple that harmonics cause in the finest period of an axis; none where it has five or more steps.
 
     ``stack`` (n, h, w) under equal light, which clips at ``white``; ``noise`` (a, b) of its grey levels. About 40,000
     pixels along the image lines that cross the fringes are used.
@@ -88,8 +86,8 @@ def estimate_aliased_harmonics(
     if not M.is_significant or size / np.sqrt(2) < NOISE_PART * pieces.sigma:
         return none
     n = pieces.steps
-    if d.is_significant and d.value * M.value > 0 and _slope(n, M.value, d.value).min() > 0.1:
-        noise_gain = float(np.mean(_slope(n, M.value, d.value) ** -2.0)) - 1
+    if d.is_significant and d.value * M.value > 0 and _compute_slope(n, M.value, d.value).min() > 0.1:
+        noise_gain = float(np.mean(_compute_slope(n, M.value, d.value) ** -2.0)) - 1
         remaining_error = float(
             np.sqrt((spread**2 + d.error**2 + second**2) / 2 + max(noise_gain, 0.0) * pieces.sigma**2)
         )
@@ -102,7 +100,10 @@ def estimate_aliased_harmonics(
 def correct_harmonics(
     harmonics: AliasedHarmonics, layout: Layout, phase: np.ndarray, wrapped: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Absolute and wrapped phase (h, w) float32 rad without the ripple, where it is to be corrected; else as given."""
+    """Remove the ripple from absolute and wrapped phase (h, w) float32 rad, where it is known well enough to correct.
+
+    Otherwise both are returned unchanged.
+    """
     if not harmonics.is_corrected:
         return phase, wrapped
     added = harmonics.correction(wrapped + np.float32(layout.offset_rad))
@@ -112,7 +113,7 @@ def correct_harmonics(
 
 
 def describe_gamma(harmonics: AliasedHarmonics, layout: Layout) -> list[Suspect]:
-    """What the operator should know about gamma, and change."""
+    """Return a suspect that reports a significant ripple to the operator; empty without one."""
     if not harmonics.is_significant:
         return []
     per_rad = layout.period_px / (2 * np.pi)
@@ -134,8 +135,11 @@ def describe_gamma(harmonics: AliasedHarmonics, layout: Layout) -> list[Suspect]
 
 @dataclass(frozen=True, eq=False)
 class _Pieces:
-    """k pieces of image lines, s pixels each: ``theta`` (k, s) rad, unwrapped; ``modulation`` (k, s) relative to the
-    piece's mean; ``block`` (k,) part of the image; ``sigma`` median phase noise, rad."""
+    """Pieces of image lines, k pieces of s pixels each.
+
+    ``theta`` (k, s): phase in rad, unwrapped; ``modulation`` (k, s): relative to the piece's mean; ``block`` (k,): part
+    of the image; ``sigma``: median phase noise, rad.
+    """
 
     steps: int
     theta: np.ndarray
@@ -188,7 +192,10 @@ def _cut_pieces(layout: Layout, stack: np.ndarray, white: float, noise: tuple[fl
 def _sample_lines(
     stack: np.ndarray, indices: list[int], white: float, noise: tuple[float, float]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-    """Phasor, background and validity (lines, pixels) of some image rows, and the fringes per pixel along them."""
+    """Return phasor, background and validity (lines, pixels) of some image rows.
+
+    Fourth, the median number of fringes per pixel along them.
+    """
     rows = select_rows(stack.shape[1], stack.shape[2], PIXELS)
     frames = np.stack([stack[i][rows] for i in indices])
     clipped = (frames >= white).any(axis=0)
@@ -205,12 +212,15 @@ def _sample_lines(
 
 
 def _fit_ripple(pieces: _Pieces) -> tuple[_Amplitude, _Amplitude, float, float] | None:
-    """M and d; how d varies over the image; and the phase ripple that is left at twice the waves."""
+    """Fit the ripple's amplitudes M and d; None for too few pieces.
+
+    Third, the standard deviation of d over the image; fourth, the phase ripple that remains at the double frequency.
+    """
     M = d = 0.0
     n, size = pieces.steps, pieces.theta.shape[1]
     x = np.broadcast_to(np.linspace(-1, 1, size), pieces.theta.shape)
     for _ in range(ROUNDS):
-        added = _correction(pieces.theta, n, M, d)
+        added = _compute_correction(pieces.theta, n, M, d)
         theta = pieces.theta + added
         ripples = [f(m * n * theta) for m in (1, 2) for f in (np.cos, np.sin)]
         design = np.stack([np.ones_like(x), x, x**2, *ripples], axis=2)
@@ -224,7 +234,7 @@ def _fit_ripple(pieces: _Pieces) -> tuple[_Amplitude, _Amplitude, float, float] 
         information = 1 / np.diagonal(inverse, axis1=1, axis2=2)
         # rows: constant, x, x^2, cos, sin, cos 2, sin 2; columns: phase, modulation
         phase_cosine, phase_sine, second, modulation_cosine, modulation_sine = (
-            _robust_mean(weights[good, row, column], information[good, row], pieces.block[good])
+            _compute_robust_mean(weights[good, row, column], information[good, row], pieces.block[good])
             for row, column in ((3, 0), (4, 0), (6, 0), (3, 1), (4, 1))
         )
         if not np.isfinite([phase_sine[0], modulation_cosine[0]]).all():
@@ -239,8 +249,8 @@ def _fit_ripple(pieces: _Pieces) -> tuple[_Amplitude, _Amplitude, float, float] 
     )
 
 
-def _robust_mean(values: np.ndarray, weights: np.ndarray, block: np.ndarray) -> tuple[float, float, float]:
-    """Weighted mean without outliers, its standard error, and the standard deviation of the blocks' means."""
+def _compute_robust_mean(values: np.ndarray, weights: np.ndarray, block: np.ndarray) -> tuple[float, float, float]:
+    """Return weighted mean without outliers, its standard error, and standard deviation of the blocks' means."""
     if len(values) == 0:
         return np.nan, np.nan, np.nan
     middle = np.median(values)
@@ -258,8 +268,11 @@ def _robust_mean(values: np.ndarray, weights: np.ndarray, block: np.ndarray) -> 
     return mean, spread * float(np.sqrt(share @ share)), spread
 
 
-def _correction(theta: np.ndarray, n: int, M: float, d: float) -> np.ndarray:
-    """What to add to measured arguments ``theta``: the ripple's inverse, from a table over one wave."""
+def _compute_correction(theta: np.ndarray, n: int, M: float, d: float) -> np.ndarray:
+    """Return the correction (rad) to add to measured arguments ``theta`` (rad).
+
+    It is the inverse of the ripple, from a table over one wave.
+    """
     wave = np.linspace(-np.pi, np.pi, 1025)
     error = np.arctan2(-d * np.sin(wave), 1 + M * np.cos(wave))
     place = n * theta
@@ -267,7 +280,7 @@ def _correction(theta: np.ndarray, n: int, M: float, d: float) -> np.ndarray:
     return np.interp(place, np.maximum.accumulate(wave + n * error), -error)
 
 
-def _slope(n: int, M: float, d: float) -> np.ndarray:
-    """Derivative of the measured argument with respect to the true one, over one wave."""
+def _compute_slope(n: int, M: float, d: float) -> np.ndarray:
+    """Return the derivative of the measured argument with respect to the true one, at 1024 points of one wave."""
     wave = np.linspace(-np.pi, np.pi, 1025)
     return np.diff(wave + n * np.arctan2(-d * np.sin(wave), 1 + M * np.cos(wave))) / np.diff(wave)

@@ -1,4 +1,4 @@
-"""How well the frames of one axis agree with each other under a hypothesis of what each of them shows."""
+"""Agreement of the frames of one axis with each other, under a hypothesis of what each of them shows."""
 
 from dataclasses import dataclass, replace
 
@@ -11,33 +11,33 @@ from slviewer.fringe.limits import OUTSIDE_PX
 
 TWO_PI = 2 * np.pi
 REACH = (4, 16)
-"""px between two read pixels that count as neighbours, at least and at most: an edge blurred over so many is still one
-edge. In between it is a third of the finest stripe's width, which leaves the next edge out of reach."""
+"""Smallest and largest distance, px, of decided pixels that count as neighbours: an edge may be blurred over it. In
+between it is a third of the finest stripe's width, which excludes the next edge."""
 READABLE_STRIPE = 6.0
-"""px: mean width of stripes that most pixels are inside of."""
+"""Mean width of stripes, px, from which most pixels are inside a stripe."""
 READABLE_SHARE = 0.5
 FEWEST_EDGES = 50
-"""With fewer code edges a share is known to no better than 7 %, and nothing is judged by it."""
+"""Number of code edges below which shares are not tested: they are accurate to no better than 7 %."""
 FEWEST_OF_BIT = 10
-"""Edges of one bit that contradict the others before it is doubted: most of so many are no chance."""
+"""Edges of one bit that must contradict the other bits before its own share is tested."""
 MIN_KEPT = 0.15
-"""Share of the pixels at which all readable bits are decided; stripes of 6 px and wider leave more than a third."""
+"""Smallest share of pixels at which all readable bits are decided; with stripes of 6 px it is more than a third."""
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """Shares weighed by modulation; NaN where the frames do not tell.
+    """Measured agreement of the frames of one axis; shares are weighted by modulation, NaN where unknown.
 
-    ``opposed``: share of the pixels inside stripes that are bright in a bit and dark in its inverse, or the other way
-    round, of the bit with the least. ``edges``: code edges that were read. ``rule``: share of the edges that obey the
-    Gray code, of the bit with the least. ``common``: length of the mean unit vector of the wrapped phases at code
-    edges; ``rising``: share of them at which the phase rises with the code; ``begin_turns``: where in a period
-    (-0.5 ... 0.5) the code's cells begin;
-    ``turns_per_cell`` fringes in a cell of the Gray code.
-    ``level_common``, ``level_turns``: the same for the step from each period to the next finer, in periods.
-    ``outside``: share of the coordinates beyond the projector, ``reach_px`` their largest. ``unreadable``: the first
-    bit, from 0, that cannot be read though its stripes are wide. ``borders``: phase (rad), number and weight of the
-    cells' borders that were seen.
+    ``opposed``: share of the pixels inside stripes that are bright in a bit and dark in its inverse, or vice versa; the
+    minimum over all bits. ``edges``: number of code edges. ``rule``: share of the edges that obey the Gray code; the
+    minimum over all bits. ``common``: length of the mean unit vector of the wrapped phases at code edges; ``rising``:
+    share of the edges at which the phase rises with the code; ``begin_turns``: position within a period (-0.5 ... 0.5)
+    at which the cells of the code begin; ``turns_per_cell``: fringe periods per cell of the Gray code.
+
+    ``level_common``, ``level_turns``: length and mean, in periods, of the step from each period to the next finer one.
+    ``outside``: share of the coordinates beyond the projector; ``reach_px``: their 99.5 % quantile. ``unreadable``: the
+    first bit, from 0, that cannot be read although its stripes are wide. ``borders``: phase (rad), number and weight of
+    the cell borders in view.
     """
 
     opposed: float = np.nan
@@ -56,12 +56,15 @@ class Agreement:
 
 
 def measure_agreement(reader: AxisReader, frames: AxisFrames) -> Agreement:
-    """How well the frames agree under this hypothesis."""
+    """Measure how well the frames of an axis agree under a hypothesis; the result is cached by the reader."""
     return reader.recall(_measure_agreement, frames)
 
 
 def measure_code_agreement(reader: AxisReader, frames: AxisFrames) -> Agreement:
-    """The part of `measure_agreement` that the Gray code alone tells; all of what is unknown without one."""
+    """Measure only the agreement of the Gray code: `opposed`, `rule`, `edges` and `unreadable` of an `Agreement`.
+
+    Without Gray bits, or with too few illuminated pixels, all values are unknown.
+    """
     if len(reader.swing) < FEWEST_PIXELS or not frames.bits:
         return Agreement()
     code, edges, rule = reader.recall(_read_checked_code, frames.bits, frames.inverse, frames.inverted, most=RECENT)
@@ -71,7 +74,7 @@ def measure_code_agreement(reader: AxisReader, frames: AxisFrames) -> Agreement:
 
 
 def _measure_agreement(reader: AxisReader, frames: AxisFrames) -> Agreement:
-    """`measure_agreement` of a hypothesis that is not cached."""
+    """Compute `measure_agreement` for a hypothesis that is not cached."""
     result = measure_code_agreement(reader, frames)
     if len(reader.swing) < FEWEST_PIXELS:
         return result
@@ -90,8 +93,12 @@ def _measure_agreement(reader: AxisReader, frames: AxisFrames) -> Agreement:
 
 @dataclass(frozen=True, eq=False)
 class _Code:
-    """Of the pixels in ``kept`` (indices): the first ``count`` bits as a Gray number; ``known`` masks its bits;
-    ``reach`` px between neighbours."""
+    """Gray code of the sampled pixels at which all readable bits are decided.
+
+    ``kept`` (k,): indices of these pixels. ``gray``, ``binary`` (k,) int32: the first ``count`` bits as a Gray and as a
+    binary number; ``known``: mask of the bits that have an image. ``unreadable``: see `Agreement`. ``reach``: largest
+    distance, px, between neighbours.
+    """
 
     kept: np.ndarray
     gray: np.ndarray
@@ -104,7 +111,10 @@ class _Code:
 
 @dataclass(frozen=True, eq=False)
 class _Edges:
-    """Pairs of kept pixels between which the code changes by one, from ``first`` up to ``second``."""
+    """Code edges: neighbouring pixels whose codes differ by one, as indices into ``_Code.kept``.
+
+    ``first`` (e,): the pixel with the lower code; ``second`` (e,): the pixel with the higher code.
+    """
 
     first: np.ndarray
     second: np.ndarray
@@ -113,7 +123,7 @@ class _Edges:
 def _read_checked_code(
     reader: AxisReader, bits: tuple[int | None, ...], inverse: tuple[int | None, ...], inverted: bool
 ) -> tuple[_Code, _Edges, float]:
-    """The Gray code, its edges, and the share of them that obey its rule."""
+    """Return the Gray code, its edges, and the share of the edges that obey the Gray code."""
     code = _read_code(reader, bits, inverse, inverted)
     rule, edges = _check_code_rule(reader, code)
     return code, edges, rule
@@ -131,7 +141,7 @@ def _read_code(
     count = readable.index(False) if False in readable else len(bits)
     while count and bits[count - 1] is None:
         count -= 1
-    unreadable = _first_unreadable(reader, bits, count)
+    unreadable = _locate_unreadable_bit(reader, bits, count)
     while True:
         chosen = [(b, bit) for b, bit in enumerate(bits[:count]) if bit is not None]
         if not chosen:
@@ -160,12 +170,21 @@ def _read_code(
 
 
 def _is_readable(bit: tuple[np.ndarray, np.ndarray, float, float]) -> bool:
-    """Whether enough pixels of a bit are decided, and its stripes are wide enough."""
+    """Return whether enough pixels of a bit are decided and its stripes are wide enough.
+
+    ``bit``: value, decided mask, share of decided pixels and mean stripe width in px, see `AxisReader._read_bit`.
+    """
     return bit[2] > READABLE_SHARE and bit[3] >= READABLE_STRIPE
 
 
 def _measure_opposition(reader: AxisReader, frames: AxisFrames) -> float:
-    """Of bits no finer than one whose stripes are clearly wider than blur, which makes both images one grey."""
+    """Return the smallest share, over all bits, of pixels at which a bit and its inverse are opposite.
+
+    NaN without inverses.
+
+    Only bits down to the finest one whose stripes are clearly wider than the blur are compared: blur makes both images
+    of a finer bit one grey.
+    """
     pairs = list(zip(frames.bits, frames.inverse, strict=False))
     readable = [
         b
@@ -176,10 +195,13 @@ def _measure_opposition(reader: AxisReader, frames: AxisFrames) -> float:
     return min(filter(np.isfinite, shares), default=np.nan)
 
 
-def _first_unreadable(
+def _locate_unreadable_bit(
     reader: AxisReader, bits: list[tuple[np.ndarray, np.ndarray, float, float] | None], count: int
 ) -> int | None:
-    """The first bit that cannot be read although its stripes should be wide; None where blur explains all."""
+    """Return the index of the first bit that is unreadable although its stripes should be wide.
+
+    None if there is none.
+    """
     if count == len(bits) or bits[count] is None or len(reader.swing) < FEWEST_PIXELS:
         return None
     widths = [bit[3] for bit in bits[:count] if bit is not None]
@@ -192,7 +214,7 @@ def _first_unreadable(
 
 
 def _check_code_rule(reader: AxisReader, code: _Code) -> tuple[float, _Edges]:
-    """Share of each bit's edges that obey the Gray code, the least of all bits; and the edges that obey."""
+    """Return the share of code edges that obey the Gray code, the minimum over all bits, and the edges that obey it."""
     pixels = code.kept
     at = np.flatnonzero(code.gray[1:] != code.gray[:-1])
     first, second = pixels[at], pixels[at + 1]
@@ -218,7 +240,7 @@ def _check_code_rule(reader: AxisReader, code: _Code) -> tuple[float, _Edges]:
 def _add_phase_agreement(
     reader: AxisReader, frames: AxisFrames, code: _Code, edges: _Edges, result: Agreement
 ) -> Agreement:  # fmt: skip
-    """Complete ``result`` by how the fringes' phase agrees with the edges of the code, where there are fringes."""
+    """Return ``result`` with the agreement of the fringe phase with the code edges added; unchanged without fringes."""
     assert frames.fringe is not None
     phasor = reader.phasor(frames.fringe[1], frames)
     if phasor is None:
@@ -245,8 +267,10 @@ def _add_phase_agreement(
 
 
 def common_phase(angle: np.ndarray, border_turns: np.ndarray, weight: np.ndarray) -> tuple[float, float]:
-    """(length, turns -0.5 ... 0.5) of the mean unit vector of the phases (rad) at the borders of cells, less what the
-    cells before them hold. The turns are the mean of those near the common phase alone: the rest are depth steps.
+    """Return length and direction (turns, -0.5 ... 0.5) of the mean unit vector of the phases at cell borders.
+
+    ``angle`` (e,): phases (rad); ``border_turns`` (e,): periods from code 0 to each border, which are subtracted;
+    ``weight`` (e,). The direction is averaged over the phases near the common one only: the others are depth steps.
     """
     unit = np.exp(1j * (angle - TWO_PI * border_turns))
     mean = complex((weight * unit).sum()) / max(float(weight.sum()), 1e-9)
@@ -260,8 +284,10 @@ def common_phase(angle: np.ndarray, border_turns: np.ndarray, weight: np.ndarray
 
 
 def _estimate_turns_per_cell(code: _Code, edges: _Edges, angle: np.ndarray, gaps: np.ndarray) -> float:
-    """Fringes between two successive edges of the code along a line, the median; ``angle`` the unwrapped
-    phase, ``gaps`` of the reader."""
+    """Return the median number of fringe periods between two successive code edges along a line; NaN for too few edges.
+
+    ``angle`` (p,): unwrapped phase (rad); ``gaps`` (p,): see `AxisReader.gaps`.
+    """
     here, there = code.kept[edges.first], code.kept[edges.second]
     order = np.argsort(np.minimum(here, there))
     lower_cell, middle = np.minimum(here, there)[order], ((angle[here] + angle[there]) / 2)[order]
@@ -275,7 +301,7 @@ def _estimate_turns_per_cell(code: _Code, edges: _Edges, angle: np.ndarray, gaps
 
 
 def _add_coordinate_range(reader: AxisReader, frames: AxisFrames, code: _Code, result: Agreement) -> Agreement:
-    """Where the coordinates lie that the code tells, to within the cells that were read."""
+    """Return ``result`` with the range of the coordinates that the code gives, to within the cells that were read."""
     if code.known != (1 << code.count) - 1 or len(code.kept) < FEWEST_PIXELS:
         return result
     cell = frames.cell_of(code.count)
@@ -287,7 +313,10 @@ def _add_coordinate_range(reader: AxisReader, frames: AxisFrames, code: _Code, r
 def _measure_coordinate_range(
     coordinate: np.ndarray, weight: np.ndarray, cell: float, extent: int | None, result: Agreement
 ) -> Agreement:  # fmt: skip
-    """``coordinate``: where cells of so many px begin."""
+    """Return ``result`` with the largest coordinate and the share of coordinates outside the projector.
+
+    ``coordinate`` (p,): px at which the cell of each pixel begins; ``weight`` (p,); ``cell``: width of the cells, px.
+    """
     result = replace(result, reach_px=float(np.quantile(coordinate + cell, 0.995)) if len(coordinate) else np.nan)
     if extent is None:
         return result
@@ -296,8 +325,9 @@ def _measure_coordinate_range(
 
 
 def estimate_coordinates(reader: AxisReader, frames: AxisFrames) -> np.ndarray:
-    """(p,) float64 projector px of all pixels of the sample, to within a cell of the bits that can be read; NaN where
-    they are not read.
+    """Return the projector coordinate px, (p,) float64, of all pixels of the sample; NaN where it cannot be read.
+
+    A Gray code gives it to within a cell of the finest readable bit.
     """
     out = np.full(len(reader.illuminated), np.nan)
     if len(reader.swing) == 0:
@@ -313,7 +343,7 @@ def estimate_coordinates(reader: AxisReader, frames: AxisFrames) -> np.ndarray:
 
 
 def _measure_level_agreement(reader: AxisReader, frames: AxisFrames, result: Agreement) -> Agreement:
-    """Of several periods without a Gray code."""
+    """Return ``result`` with the agreement of several fringe periods with each other, without a Gray code."""
     levels = _unwrap_levels_of_sample(reader, frames)
     if levels is None:
         return result
@@ -325,7 +355,11 @@ def _measure_level_agreement(reader: AxisReader, frames: AxisFrames, result: Agr
 def _unwrap_levels_of_sample(
     reader: AxisReader, frames: AxisFrames
 ) -> tuple[tuple[float, ...], tuple[float, ...], np.ndarray, np.ndarray] | None:
-    """Concentration and mean of the step to each finer level, coordinates (p,) in px, and the weight of each pixel."""
+    """Unwrap the fringe periods of the sample from the longest to the finest; None where they cannot be unwrapped.
+
+    Returns the concentration and the mean, in periods, of the step to each finer level, and coordinate px and weight
+    (p,) of each pixel.
+    """
     phasors = [reader.phasor(images, frames) for _, images in frames.shifts]
     if any(p is None for p in phasors) or not len(reader.swing):
         return None
@@ -334,7 +368,7 @@ def _unwrap_levels_of_sample(
     periods = tuple(period for period, _ in frames.shifts)
     try:
         levels = plan_levels(periods, frames.extent or 1)
-    except InputError:  # periods that cover the projector not at all leave the phase relative
+    except InputError:  # the periods do not cover the projector: the phase is relative
         return None
     low = lowest_coordinate(levels[0].period_px, frames.extent or int(levels[0].period_px))
     coordinate, _, turns = unwrap_levels(levels, wrapped, low)

@@ -1,4 +1,4 @@
-"""One point in which the frames of a capture contradict its description."""
+"""Contradiction between the frames of a capture and its description."""
 
 from dataclasses import dataclass
 
@@ -7,8 +7,10 @@ from slviewer.fringe.sequence import Axis
 
 @dataclass(frozen=True)
 class Contradiction:
-    """``cause`` in one of the agreed words; ``message``: what was seen and what to do; ``axis`` None for both;
-    ``value`` that fits instead of the described one, in the unit of the message, None where it is no number.
+    """Contradiction between the frames of a capture and its description.
+
+    ``cause``: one of a fixed set of labels; ``message``: what was observed and what to do; ``axis``: None for both;
+    ``value``: the value that fits instead of the described one, in the unit of the message, None where it is no number.
     """
 
     cause: str

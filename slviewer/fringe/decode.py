@@ -1,4 +1,4 @@
-"""From the frames of a capture to a phase map: the fast way. `reference` is the definition."""
+"""Decoding of the frames of a capture to a phase map, by kernels. `reference` is the definition."""
 
 import numpy as np
 
@@ -19,12 +19,12 @@ __all__ = ["decode", "decode_reference", "texture"]
 def decode(
     sequence: PatternSequence, stack: np.ndarray, axis: Axis, light: FrameLight | None = None
 ) -> PhaseMap:  # fmt: skip
-    """The phase map of one axis from the (n, h, w) uint8 or uint16 frames of a sequence.
+    """Decode the phase map of one axis from the (n, h, w) uint8 or uint16 frames of a sequence.
 
     A pixel is masked, with a reason, rather than given a doubtful phase. Where the light differed between the frames
-    (see `frame_light`), they are decoded as they would be under equal light; what gamma leaves in the phase of three or
-    four steps (see `aliased_harmonics`) is corrected. ``light``: from `estimate_frame_light`; estimated if None. Raises
-    InputError when the frames are not those of the sequence, or cannot give an absolute phase.
+    (see `frame_light`), they are decoded as they would be under equal light; the phase error that gamma causes with
+    three or four steps (see `aliased_harmonics`) is corrected. ``light``: from `estimate_frame_light`; estimated if
+    None. Raises InputError when the frames are not those of the sequence, or cannot give an absolute phase.
     """
     check_stack(sequence, stack)
     layout = axis_layout(sequence, axis)
@@ -38,7 +38,7 @@ def decode(
     scale = grey_scale(layout, noise, white * factor)._replace(white=clipped)
     maps = tuple(np.empty(stack.shape[1:], dtype) for dtype in (*[np.float32] * 4, np.uint8))
     if not layout.shifts:
-        kernels_gray.decode_gray(stack, scale, _gray_rules(layout), maps)
+        kernels_gray.decode_gray(stack, scale, _pack_gray_rules(layout), maps)
     elif layout.numbers_periods:
         mean = fringe_mean(layout, stack) if layout.is_plain else MIDDLE
         kernels_coded.decode_coded(stack, pack_shifts(layout), scale, code_rules(layout, mean), maps)
@@ -50,7 +50,7 @@ def decode(
 
 
 def texture(sequence: PatternSequence, stack: np.ndarray) -> np.ndarray:
-    """(h, w) of the stack's dtype: the scene under white light.
+    """Return an image of the scene under white light, (h, w) of the stack's dtype.
 
     The texture frame, else the white frame, else the background of the first axis' finest phase steps, else the
     brightest level of each pixel.
@@ -69,7 +69,7 @@ def texture(sequence: PatternSequence, stack: np.ndarray) -> np.ndarray:
 
 
 def _repair_spikes(layout: Layout, phase: np.ndarray, reason: np.ndarray) -> None:
-    """Move phases that were read from the wrong side of a code edge, and mask those without support."""
+    """Move phases that were read on the wrong side of a code edge, and mask those without support, in place."""
     rules, lists = spike_rules(layout), kernels_spikes.allocate_lists(phase.shape)
     if rules.is_plain:
         kernels_spikes.list_changes(phase, rules, False, *lists)
@@ -79,12 +79,12 @@ def _repair_spikes(layout: Layout, phase: np.ndarray, reason: np.ndarray) -> Non
 
 
 def grey_scale(layout: Layout, noise: tuple[float, float], white: float) -> kernels.Scale:
-    """The grey levels that decide about a pixel, from the noise (a, b) and the level at which the camera clips."""
+    """Return the grey levels that decide about a pixel, from the noise (a, b) and the clipping level ``white``."""
     return kernels.Scale(*noise, limits.DARK_LEVELS * white / 255, dark_sigmas(layout), white)
 
 
 def code_rules(layout: Layout, mean: float) -> kernels_coded.CodeRules:
-    """The Gray bits of a layout whose code numbers periods; ``mean`` as `threshold.fringe_mean` returns it."""
+    """Return the Gray bits of a layout whose code numbers periods; ``mean`` as `threshold.fringe_mean` returns it."""
     return kernels_coded.CodeRules(
         np.array(layout.gray, np.int64),
         np.array(layout.inverse, np.int64),
@@ -94,8 +94,8 @@ def code_rules(layout: Layout, mean: float) -> kernels_coded.CodeRules:
     )
 
 
-def _gray_rules(layout: Layout) -> kernels_gray.GrayRules:
-    """The Gray bits of a layout without phase steps."""
+def _pack_gray_rules(layout: Layout) -> kernels_gray.GrayRules:
+    """Return the Gray bits of a layout without phase steps."""
     return kernels_gray.GrayRules(
         np.array(layout.gray, np.int64),
         np.array(layout.inverse, np.int64),
@@ -109,7 +109,7 @@ def _gray_rules(layout: Layout) -> kernels_gray.GrayRules:
 
 
 def pack_shifts(layout: Layout) -> kernels.Shifts:
-    """The frames of all periods of a layout, and the cosines and sines that they are weighted with."""
+    """Pack the frames of all periods of a layout, and the cosines and sines that weight them, for the kernels."""
     frames, angles, half_turns, counted = [], [], [], []
     for shift in layout.shifts:
         n = len(shift.indices)
@@ -140,8 +140,10 @@ def pack_shifts(layout: Layout) -> kernels.Shifts:
 
 
 def pack_levels(layout: Layout, mean: float = MIDDLE) -> kernels_levels.Ladder:
-    """How a layout's periods, and cells that its Gray bits number, become one absolute phase; without levels where bits
-    number the periods. ``mean`` as `threshold.fringe_mean` returns it."""
+    """Pack the levels of a layout for the kernels: periods, and cells that its Gray bits number.
+
+    Without levels where bits number the periods. ``mean`` as `threshold.fringe_mean` returns it.
+    """
     levels = () if layout.numbers_periods else layout_levels(layout)
     bits = code_bits(layout) if layout.numbers_cells else ()
     extent = min(layout.extent, unambiguous_px(layout)) if levels else 0.0

@@ -1,4 +1,4 @@
-"""Changes of one axis' description with which its frames agree: bits, signs, offsets, cells, periods and sizes."""
+"""Changes of the description of one axis that make its frames agree: bits, signs, offsets, cells, periods and sizes."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -23,13 +23,16 @@ from slviewer.fringe.contradiction import Contradiction
 from slviewer.fringe.sequence import Axis, PatternSequence
 
 CLEARLY = 0.1
-"""By which the shares of one hypothesis must exceed those of a simpler one."""
+"""Amount by which the shares of one hypothesis must exceed those of a simpler one."""
 GAMMAS = (1.6, 1.9, 2.2, 2.5)
 LINES = {"x": "columns", "y": "rows"}
 
 
 def explain_axis(reader: AxisReader, sequence: PatternSequence, axis: Axis) -> list[Answer]:
-    """The fewest changes of one axis' description with which its frames agree; several where they do so equally."""
+    """Return the smallest changes of the description of an axis that make its frames agree, the best first.
+
+    Several answers are returned if they explain the frames about equally well, none if no change does.
+    """
     answers: list[Answer] = []
     for variant, changes in _list_variants(described_frames(sequence, axis), axis):
         explain = _fit_code_values if variant.bits else _fit_level_offset
@@ -40,7 +43,7 @@ def explain_axis(reader: AxisReader, sequence: PatternSequence, axis: Axis) -> l
         return []
     fewest = min(_count_changes(answer) for answer in answers)
     answers = sorted((a for a in answers if _count_changes(a) == fewest), key=lambda a: -a.score)
-    # Several gammas fit more or less: the best of them stands for all.
+    # Several gammas fit more or less: only the best of them is returned.
     first = answers[0].contradictions[0].cause
     return [
         answers[0],
@@ -49,12 +52,12 @@ def explain_axis(reader: AxisReader, sequence: PatternSequence, axis: Axis) -> l
 
 
 def _count_changes(answer: Answer) -> int:
-    """Number of changes that an answer makes to the description."""
+    """Return the number of changes that an answer makes to the description."""
     return len(answer.contradictions)
 
 
 def _list_variants(frames: AxisFrames, axis: Axis) -> Iterator[tuple[AxisFrames, list[Contradiction]]]:
-    """The description with bits, phase sign or both changed; and what each change means."""
+    """Yield variants of the description (bit order, phase sign, gamma) and the contradictions that each stands for."""
     bits: list[tuple[AxisFrames, list[Contradiction]]] = [(frames, [])]
     if len(frames.bits) - frames.complementary > 1:
         text = f"the Gray bits of axis {axis} are in reverse order, the finest stripes first: reverse the bit numbers"
@@ -90,7 +93,10 @@ def _list_variants(frames: AxisFrames, axis: Axis) -> Iterator[tuple[AxisFrames,
 def _fit_code_values(
     reader: AxisReader, frames: AxisFrames, axis: Axis, changes: list[Contradiction]
 ) -> Answer | None:  # fmt: skip
-    """The changes, and the values besides them with which all tests are passed; None if there are none."""
+    """Fit cell width, offsets and size to frames with Gray bits; return the changes with which all tests pass.
+
+    ``changes``: those that the variant ``frames`` already makes. None if no values fit, or if nothing changes.
+    """
     a = measure_agreement(reader, frames)
     failed = failed_tests(frames, a)
     out = list(changes)
@@ -99,7 +105,7 @@ def _fit_code_values(
     if frames.fringe is not None:
         period = frames.fringe[0]
         if failed & {"common", "cell"}:
-            cell, common, begin = _best_cell(frames, a)
+            cell, common, begin = _fit_cell_width(frames, a)
             if common < SURE or not a.rising > SURE:
                 return None
             a = replace(a, common=common, begin_turns=begin)
@@ -132,13 +138,16 @@ def _fit_code_values(
     return Answer(tuple(out), sum_shares(a), is_certain(a)) if out else None
 
 
-def _best_cell(frames: AxisFrames, a: Agreement) -> tuple[float, float, float]:
-    """(px, concentration, turns): the width of the Gray cells for which all edges fall at one phase."""
+def _fit_cell_width(frames: AxisFrames, a: Agreement) -> tuple[float, float, float]:
+    """Fit the width of the Gray cells: all code edges then have one phase of the fringes.
+
+    Returns the width in px, and the concentration and the mean (turns, -0.5 ... 0.5) of the phase, see `common_phase`.
+    """
     assert frames.fringe is not None and a.borders is not None
     angle, border, weight = a.borders
     turns = a.turns_per_cell if np.isfinite(a.turns_per_cell) else frames.cell_px / frames.fringe[0]
     ratios = np.arange(0.88, 1.121, 0.0005) * turns
-    # From one ratio to the next all unit vectors turn on by the same angles.
+    # From one ratio to the next each unit vector rotates by the same angle.
     unit = weight * np.exp(1j * (angle - 2 * np.pi * border * ratios[0]))
     step = np.exp(2j * np.pi * border * (ratios[0] - ratios[1]))
     lengths = []
@@ -150,7 +159,11 @@ def _best_cell(frames: AxisFrames, a: Agreement) -> tuple[float, float, float]:
 
 
 def _describe_phase_shift(frames: AxisFrames, a: Agreement, late: float, axis: Axis) -> list[Contradiction]:
-    """Fringes and Gray code apart by ``late`` periods: either of them may begin elsewhere than described."""
+    """Return the two contradictions that explain a shift of ``late`` periods between fringes and Gray code.
+
+    Either the phase steps or the Gray code may begin elsewhere than described; the more probable contradiction comes
+    first.
+    """
     assert frames.fringe is not None
     period, steps = frames.fringe[0], len(frames.fringe[1])
     offset = wrap((frames.offset_rad + 2 * np.pi * late) / (2 * np.pi)) * 2 * np.pi
@@ -175,7 +188,7 @@ def _describe_phase_shift(frames: AxisFrames, a: Agreement, late: float, axis: A
 
 
 def explain_reach(frames: AxisFrames, a: Agreement, axis: Axis) -> list[Contradiction]:
-    """Coordinates beyond the projector."""
+    """Return the contradictions that explain coordinates outside the projector: its size, and the fringe period."""
     assert frames.extent is not None
     observation = (
         f"{100 * a.outside:.0f} % of the {axis} codes lie outside the projector's {frames.extent} {LINES[axis]} and "
@@ -193,7 +206,7 @@ def explain_reach(frames: AxisFrames, a: Agreement, axis: Axis) -> list[Contradi
 def _fit_level_offset(
     reader: AxisReader, frames: AxisFrames, axis: Axis, changes: list[Contradiction]
 ) -> Answer | None:  # fmt: skip
-    """The same where several periods number the fringes."""
+    """Fit the phase offset to frames of several periods without Gray bits; return the changes, None without any."""
     a = measure_agreement(reader, frames)
     failed = failed_tests(frames, a)
     if "levels" in failed or not is_supported(frames, a):
@@ -224,7 +237,7 @@ def _fit_level_offset(
 
 
 def describe_turns(angle: float) -> str:
-    """An angle (rad) in words, as a share of a period."""
+    """Return an angle (rad) as text, a share of a period with its direction: "a quarter period later"."""
     turns = wrap(angle / (2 * np.pi))
     share = {0.25: "a quarter period", 0.5: "half a period"}.get(round(abs(turns) * 20) / 20)
     return f"{share or f'{abs(turns):.2f} periods'} {'later' if turns > 0 else 'earlier'}"

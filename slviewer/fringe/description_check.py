@@ -1,7 +1,7 @@
-"""Whether the description of a capture fits its frames, and which other description or order of the frames would.
+"""Check of the description of a capture against its frames, and search for a description or frame order that fits.
 
-A hypothesis is believed when the description fails a test that it passes: code edges obey the Gray code, fall at one
-phase of the fringes, and the phase rises with the code; each fringe period leads to the next finer one; coordinates lie
+A hypothesis is accepted if it passes a test that the description fails: code edges obey the Gray code, have one phase
+of the fringes, and the phase rises with the code; each fringe period predicts the next finer one; coordinates are
 inside the projector and are no mirror image of the scene.
 """
 
@@ -25,23 +25,25 @@ LEAST_ILLUMINATED = 0.005
 """Share of the pixels that must carry a pattern."""
 MOSTLY = 0.5
 APART = 6
-"""Pixels of the grid over which coordinates are compared: several cells of the code."""
+"""Distance, in pixels of the grid, at which coordinates are compared: several cells of the code."""
 FEWEST_TURNS = 100
 MAX_CLIPPED = 0.05
-"""Mean share of saturated values at illuminated pixels, beyond which bits and fringes become unreadable in places."""
+"""Mean share of saturated values at illuminated pixels beyond which bits and fringes are unreadable in places."""
 UNSTEADY = 0.1
-"""Relative rms of the mean brightness of phase steps, which incomplete fringes do not reach."""
+"""Relative rms of the mean brightness of phase steps from which the light is unsteady; incomplete fringes give less."""
 SUDDENLY = 0.2
-"""Of the share of saturated values later on: no more of them before means that the light changed."""
+"""Share of saturated values before a frame, relative to that from it on, below which the light has changed suddenly."""
 _OF_STEPS = ("duplicate-frame", "frame-order", "step-order")
 MIRRORED = 0.8
-"""Share of the pixels that see a mirror image where an axis is reversed; elsewhere they are noise and depth steps."""
+"""Share of mirrored pixels from which an axis is reversed; a smaller share is due to noise and depth steps."""
 
 
 def check_description(sequence: PatternSequence, stack: np.ndarray) -> tuple[Contradiction, ...]:
-    """What in the description of an (n, h, w) stack contradicts its frames, the most probable first; empty where the
-    description holds. Some rows and columns are read, weighed by modulation; frames of unequal light are compared as
-    they would be under equal light. Raises InputError for a stack that is none of this sequence.
+    """Return the contradictions between the description of an (n, h, w) stack and its frames, the most probable first.
+
+    The result is empty where the description holds. Some rows and columns are read, weighted by modulation; frames of
+    unequal light are compared as they would be under equal light. Raises InputError for a stack that does not match the
+    sequence.
     """
     check_stack(sequence, stack)
     contradictions = find_contradictions(sequence, stack)
@@ -51,7 +53,7 @@ def check_description(sequence: PatternSequence, stack: np.ndarray) -> tuple[Con
     if light.is_significant:
         under_equal_light = find_contradictions(sequence, equalize_frames(stack, light, sequence)[0])
         is_explained = all(contradiction.cause != "unreadable" for contradiction in contradictions)
-        # Frames out of their place spoil the estimate of the light: what explains them as they are is believed.
+        # Misplaced frames distort the estimate of the light: an explanation of the frames as they are has priority.
         if not under_equal_light or not is_explained:
             contradictions = under_equal_light
     if any(contradiction.cause not in ("unreadable", "duplicate-frame") for contradiction in contradictions):
@@ -71,7 +73,10 @@ def check_description(sequence: PatternSequence, stack: np.ndarray) -> tuple[Con
 
 
 def _describe_saturation(coded: list[int], clipped: np.ndarray) -> Contradiction:
-    """What to say of ``coded`` frames in which these shares of the illuminated pixels are saturated."""
+    """Return the contradiction for saturated frames, or for room light that saturates them from one frame on.
+
+    ``clipped``: share of saturated pixels in each of the ``coded`` frames, among the illuminated pixels.
+    """
     k = max(range(2, len(coded) - 1), key=lambda k: float(np.median(clipped[k:]) - clipped[:k].max()))
     if clipped[:k].max() < SUDDENLY * np.median(clipped[k:]):
         text = (
@@ -89,8 +94,11 @@ def _describe_saturation(coded: list[int], clipped: np.ndarray) -> Contradiction
 
 
 def _measure_unsteadiness(sequence: PatternSequence, sample: LineSample, illuminated: np.ndarray) -> float:
-    """The largest relative rms by which the mean brightness of the phase steps of one period differs: whatever their
-    order, under equal light it does not, as long as several fringes are seen."""
+    """Return the largest relative rms of the mean brightness of the phase steps of one period.
+
+    Under equal light the mean brightness is the same in all steps, whatever their order, as long as several fringes are
+    in view. ``illuminated`` (p,): mask of the sampled pixels to average.
+    """
     worst = 0.0
     for axis in sequence.axes:
         for _, steps in sequence.phase_shifts(axis)[-1:]:
@@ -102,8 +110,9 @@ def _measure_unsteadiness(sequence: PatternSequence, sample: LineSample, illumin
 def find_contradictions(
     sequence: PatternSequence, stack: np.ndarray, *, with_steps: bool = True
 ) -> tuple[Contradiction, ...]:  # fmt: skip
-    """The same of frames as they are, taken to be of equal light; without the phase steps' own contradictions where
-    these are known.
+    """Return the contradictions of frames as they are, assuming equal light; see `check_description`.
+
+    ``with_steps``: also check the order of the phase steps within each period.
     """
     if not sequence.axes:
         return ()
@@ -123,7 +132,7 @@ def find_contradictions(
     if not any(failed.values()) and not disordered and not strange and not uneven:
         return _detect_mirroring(sequence, sample)
     if disordered and all(contradiction.cause in _OF_STEPS for contradiction in disordered):
-        return tuple(disordered)  # steps of one period, which says all about them
+        return tuple(disordered)  # steps of one period, which are explained completely
     if exchanged := _detect_exchanged_axes(sequence, sample, failed):
         return exchanged
     answers = {axis: explain_axis(readers[axis], sequence, axis) for axis in sequence.axes if failed[axis]}
@@ -147,7 +156,7 @@ def find_contradictions(
 
 
 def _detect_missing_pattern(sequence: PatternSequence, sample: LineSample) -> tuple[Contradiction, ...]:
-    """Detect that the captures are dark, saturated, or show no pattern."""
+    """Return the contradiction of a capture that is dark, saturated or shows no pattern; empty if it shows one."""
     grid = sample.grid[coded_frames(sequence)].astype(np.float32)
     high, low = grid.max(axis=0), grid.min(axis=0)
     share = float(np.mean(high - low > sample.least_swing))
@@ -179,7 +188,10 @@ def _detect_missing_pattern(sequence: PatternSequence, sample: LineSample) -> tu
 def _detect_exchanged_axes(
     sequence: PatternSequence, sample: LineSample, failed: dict[Axis, set[str]]
 ) -> tuple[Contradiction, ...]:
-    """Both axes fit with all frames of the other one, or with its phase steps or its Gray bits alone."""
+    """Return the contradiction of exchanged axes, in all frames, or in phase steps or Gray bits only.
+
+    Accepted if both axes pass all tests with the frames of the other axis; empty if they do not.
+    """
     if len(sequence.axes) < 2 or not any(failed.values()):
         return ()
     reader = AxisReader(sample, coded_frames(sequence))
@@ -216,14 +228,17 @@ def _detect_exchanged_axes(
     return ()
 
 
-def _describe_exchanged_axes(seen: str) -> Contradiction:
-    """The contradiction of exchanged axes, from the observation that shows it."""
-    text = f"{seen}: x and y are exchanged; exchange the x and y (V and H) frames in the description"
+def _describe_exchanged_axes(observation: str) -> Contradiction:
+    """Return the contradiction of exchanged axes, from the observation that shows it."""
+    text = f"{observation}: x and y are exchanged; exchange the x and y (V and H) frames in the description"
     return Contradiction("axes-swapped", text, None, None)
 
 
 def _detect_mirroring(sequence: PatternSequence, sample: LineSample) -> tuple[Contradiction, ...]:
-    """Axes exchanged or reversed: of what camera and projector both see from the front, neither sees a mirror image."""
+    """Return the contradiction of axes that are exchanged or reversed; empty if the coordinates are not mirrored.
+
+    Camera and projector both see the scene from the front, so that neither sees a mirror image.
+    """
     if len(sequence.axes) < 2:
         return ()
     grid = grid_sample(sample)
@@ -261,7 +276,7 @@ def _detect_mirroring(sequence: PatternSequence, sample: LineSample) -> tuple[Co
 
 
 def _describe_failed_tests(axis: Axis, a: Agreement, failed: set[str]) -> Contradiction:
-    """What was seen, where no hypothesis explains it."""
+    """Return the contradiction that reports the failed tests of an axis where no hypothesis explains them."""
     if "bits" in failed:
         observation = f"Gray bit {a.unreadable} of axis {axis} cannot be read though its stripes should be wide"
     elif "inverse" in failed:

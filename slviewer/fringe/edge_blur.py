@@ -1,9 +1,9 @@
-"""Errors of the phase where the surface's brightness jumps: what the camera's blur makes of the fringes there.
+"""Errors of the phase where the surface's brightness jumps: the effect of the camera's blur on the fringes.
 
 A camera pixel receives light from a neighbourhood, and more of it from the brighter side: the pixel's phase is that of
-a place displaced towards that side. For a Gaussian point spread of standard deviation s the displacement is
-s^2 grad(ln B), B being the blurred modulation (Tweedie's formula), so that the phase is off by
-s^2 grad(phi) . grad(ln B): at silhouettes, shadows and printed edges, by far more than noise.
+a place displaced towards that side. For a Gaussian point spread of standard deviation s the displacement is s^2 grad(ln
+B), B being the blurred modulation (Tweedie's formula), so that the phase is off by s^2 grad(phi) . grad(ln B): at
+silhouettes, shadows and printed edges, by far more than noise.
 """
 
 import math
@@ -20,13 +20,13 @@ TILES = (4, 5)
 REACH = 8
 """px: half the width of the window whose contrast is compared with the steepest slope in it."""
 CONTRAST = 0.3
-"""Share of the image's usual modulation that an edge differs by."""
+"""Smallest contrast of an edge, as a share of the image's median modulation."""
 NOISE_RANGE = 10.0
-"""Standard deviations, that the contrast of noise alone in a window, some six, stays below."""
+"""Smallest contrast of an edge in standard deviations; noise alone reaches some six in a window."""
 EDGES = 10
-"""Pixels at edges, below which a tile takes the blur of the whole image."""
+"""Number of pixels at edges below which a tile has the blur of the whole image."""
 SHARPEST = 0.35
-"""Quantile of the edges' widths that counts: shading and printed gradients are wider than what blur makes of a step."""
+"""Quantile of the edges' widths that is used: shading and printed gradients are wider than a blurred step."""
 LEAST_PX = 0.3
 """Standard deviation of an ideal pixel's own aperture, 12 ** -0.5, rounded up."""
 _STEP = math.sqrt(2 * math.pi)
@@ -35,10 +35,10 @@ _STEP = math.sqrt(2 * math.pi)
 def estimate_camera_blur(
     modulation: NDArray[np.float32], mask: NDArray[np.bool_], noise: float = 0.0
 ) -> NDArray[np.float32]:
-    """Standard deviation px of the camera's point spread, (rows, columns) of `TILES` float32, from the steepness of the
-    edges of the modulation (h, w) grey levels; the aperture of an ideal pixel where there are none.
+    """Estimate the standard deviation, px, of the camera's point spread: (rows, columns) of `TILES` float32.
 
-    ``mask`` (h, w): pixels whose modulation stands above noise, which set the scale of contrast. ``noise``: standard
+    From the steepness of the edges of the modulation (h, w) grey levels; the aperture of an ideal pixel where there are
+    none. ``mask`` (h, w): pixels whose modulation is above noise, which set the scale of contrast. ``noise``: standard
     deviation of the modulation.
     """
     blur = np.full(TILES, LEAST_PX, np.float32)
@@ -73,21 +73,25 @@ def estimate_camera_blur(
 
 
 def edge_error(phase: NDArray[np.float32], modulation: NDArray[np.float32], noise: float = 0.0) -> NDArray[np.float32]:
-    """(h, w) float32, in the unit of ``phase`` (h, w): by how much the camera's blur displaces it at each pixel; NaN
-    where it is. ``modulation`` (h, w) grey levels, of standard deviation ``noise``. Depth jumps and glossy edges add
-    errors of their own."""
+    """Return the displacement of the ``phase`` (h, w) by the camera's blur: (h, w) float32 in its unit.
+
+    NaN where the phase is. ``modulation`` (h, w) grey levels, of standard deviation ``noise``. Depth jumps and glossy
+    edges add errors of their own.
+    """
     sigma = cv2.resize(
         estimate_camera_blur(modulation, np.isfinite(phase), noise), phase.shape[::-1], interpolation=cv2.INTER_LINEAR
     )
     error = np.empty_like(phase)
-    _displace(modulation, phase, sigma, np.float32(max(noise, 1e-3)), error)
+    _compute_displacement(modulation, phase, sigma, np.float32(max(noise, 1e-3)), error)
     return error
 
 
 @kernel(parallel=True)
-def _displace(modulation, phase, sigma, noise, error):
-    """s^2 |grad(phi) . grad(ln B)| beyond what noise makes of it: slopes of B over about half a standard deviation, of
-    phi on its brighter side."""
+def _compute_displacement(modulation, phase, sigma, noise, error):
+    """Fill ``error`` (h, w) with s^2 abs(grad(phi) . grad(ln B)) less the part that noise causes.
+
+    Slopes of B are taken over about half a standard deviation, of phi on its brighter side.
+    """
     height, width = phase.shape
     for v in numba.prange(height):
         for u in range(width):
@@ -99,20 +103,23 @@ def _displace(modulation, phase, sigma, noise, error):
             first, right = max(u - reach, 0), min(u + reach, width - 1)
             top, bottom = max(v - reach, 0), min(v + reach, height - 1)
             span_u, span_v = np.float32(max(right - first, 1)), np.float32(max(bottom - top, 1))
-            slope_u = _log_ratio(modulation[v, right], modulation[v, first], here) / span_u
-            slope_v = _log_ratio(modulation[bottom, u], modulation[top, u], here) / span_v
+            slope_u = _compute_log_ratio(modulation[v, right], modulation[v, first], here) / span_u
+            slope_v = _compute_log_ratio(modulation[bottom, u], modulation[top, u], here) / span_v
             far = int(np.float32(2) * sigma[v, u]) + 1
             step_u, step_v = far if slope_u > 0 else -far, far if slope_v > 0 else -far
-            along = _slope(phase, v, u, 0, step_u)
-            down = _slope(phase, v, u, step_v, 0)
+            along = _compute_slope(phase, v, u, 0, step_u)
+            down = _compute_slope(phase, v, u, step_v, 0)
             shift = along * slope_u + down * slope_v
             by_noise = np.float32(2) * (noise / here) ** 2 * ((along / span_u) ** 2 + (down / span_v) ** 2)
             error[v, u] = np.sqrt(max(shift * shift - by_noise, np.float32(0))) * sigma[v, u] * sigma[v, u]
 
 
 @kernel()
-def _log_ratio(a, b, between):
-    """ln(a / b) of levels on both sides of ``between``, itself above 0; to first order where they hardly differ."""
+def _compute_log_ratio(a, b, between):
+    """Return ln(a / b) of levels on both sides of ``between``, itself above 0.
+
+    To first order for a small difference.
+    """
     if abs(a - b) < np.float32(0.1) * between:
         return (a - b) / between
     least = np.float32(0.05) * between  # two and a half standard deviations outside of a straight edge
@@ -120,9 +127,12 @@ def _log_ratio(a, b, between):
 
 
 @kernel()
-def _slope(phase, v, u, step_v, step_u):
-    """Slope of the phase per px, one to two steps from a pixel, on the brighter side of an edge: nearer to it, blur has
-    already flattened the phase. From the pixel itself where there is less surface, 0 where there is none."""
+def _compute_slope(phase, v, u, step_v, step_u):
+    """Return the slope of the phase per px, one to two steps from a pixel, on the brighter side of an edge.
+
+    Nearer to the edge, blur has already flattened the phase. From the pixel itself where the surface ends before, 0
+    where it has no neighbour.
+    """
     height, width = phase.shape
     step = step_v + step_u
     near_v, near_u = v + step_v, u + step_u

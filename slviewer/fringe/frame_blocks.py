@@ -1,7 +1,7 @@
-"""Which images of an undescribed capture belong together: runs of phase steps, blocks of Gray bits, even light.
+"""Grouping of the images of an undescribed capture: runs of phase steps, blocks of Gray bits, and even light.
 
 Every image is compared with the darkest and the brightest level of each pixel: stripes of a code are at either end,
-phase steps add up to one level in all pixels.
+phase steps have the same mean level in all pixels.
 """
 
 from dataclasses import dataclass
@@ -15,18 +15,19 @@ from slviewer.fringe.line_sample import LineSample, sample_frames
 MOST_STEPS = 36
 MOST_BITS = 16
 MAX_SPREAD = 0.12
-"""Of half the swing, standard deviation over the pixels of the mean of all steps, which is one level for a cosine.
+"""Largest standard deviation over the pixels of the mean of all steps, as a share of half the swing; 0 for a cosine.
 Three bits of a code give 0.5, three of four steps 0.24."""
 MIN_MIDDLE = 0.15
 """Share of the levels of phase steps in the middle half of the swing: a third of a cosine's, none of a code's."""
 MAX_COMMON = 0.9
 """Length of the phases' mean unit vector; above it the view would hold a quarter of a period at most."""
 MAX_MISFIT = 0.25
-"""Of the amplitude, that a curved response and noise may leave of the steps. Frames of another period leave 0.7."""
+"""Largest residual of the steps from a curved response and noise, as a share of the amplitude. Frames of another period
+give 0.7."""
 COARSE_PIXELS, COARSE = 4_000, 1.25
 """Pixels on which images are compared with a cosine first, and the factor by which limits may be exceeded there."""
 DECIDED = 0.3
-"""Of half the swing, from which a pixel is on either side of a stripe's edge."""
+"""Distance from the middle, as a share of half the swing, from which a pixel is bright or dark."""
 READABLE = 0.5
 """Share of decided pixels from which the stripes of a bit are wider than their blur."""
 EVEN = 0.9
@@ -42,15 +43,18 @@ DROP = 0.6
 FEWEST_EDGES = 20
 """Edges of stripes from which a share of them is known to a fifth."""
 DIM = 0.25
-"""Of the brightest pixels' swing, below which light of other stripes may be reflected into a pixel."""
+"""Share of the brightest pixels' swing below which a pixel may show reflections of other stripes."""
 
 Even = Literal["white", "black"]
 
 
 @dataclass(frozen=True, eq=False)
 class PhaseRun:
-    """Images of all steps of a period. ``gradient`` (x, y) rad per camera px, the median, for a phase that rises by
-    2 pi / n from step to step; ``misfit`` of the cosine, in parts of the amplitude."""
+    """Images of all steps of a period.
+
+    ``gradient`` (x, y): median phase gradient, rad per camera px, for a phase that rises by 2 pi / n from step to step;
+    ``misfit``: rms residual of the cosine, as a share of the amplitude.
+    """
 
     images: tuple[int, ...]
     gradient: tuple[float, float]
@@ -59,8 +63,11 @@ class PhaseRun:
 
 @dataclass(frozen=True)
 class Bit:
-    """An image of stripes, or of even light (``even``), and its inverse. ``edges`` (x, y) per camera px along rows and
-    along columns, ``count`` of them; ``is_readable``: whether most pixels lie inside of stripes."""
+    """Image of stripes, or of even light (``even``), and its inverse, None without one.
+
+    ``edges`` (x, y): edges per camera px along rows and along columns; ``count``: number of edges; ``is_readable``:
+    whether most pixels are inside stripes.
+    """
 
     image: int
     inverse: int | None
@@ -71,13 +78,13 @@ class Bit:
 
     @property
     def images(self) -> tuple[int, ...]:
-        """The image of the bit, then that of its inverse."""
+        """Image of the bit, then that of its inverse."""
         return (self.image,) if self.inverse is None else (self.image, self.inverse)
 
 
 @dataclass(frozen=True)
 class GrayBlock:
-    """Bits of a code, widest stripes first. ``is_reversed``: the finest was captured first."""
+    """Bits of a Gray code, widest stripes first. ``is_reversed``: the finest bit was captured first."""
 
     bits: tuple[Bit, ...]
     is_reversed: bool
@@ -89,14 +96,17 @@ class GrayBlock:
 
     @property
     def direction(self) -> tuple[float, float]:
-        """Edges (x, y) of the finest bit that can be read."""
+        """Edges per camera px (x, y) of the finest readable bit."""
         varying_bits = [bit for bit in self.bits if bit.is_readable and bit.even is None]
         return varying_bits[-1].edges
 
 
 @dataclass(frozen=True)
 class FrameBlocks:
-    """All images of a capture in blocks, and what does not fit: (images, text)."""
+    """All images of a capture in blocks, and the images that fit no block.
+
+    ``even``: images of even light, by index; ``doubts``: (images, text) of what does not fit.
+    """
 
     runs: tuple[PhaseRun, ...]
     codes: tuple[GrayBlock, ...]
@@ -105,14 +115,15 @@ class FrameBlocks:
 
 
 def sample_undescribed(stack: np.ndarray) -> LineSample:
-    """Lines of an (n, h, w) stack of which any image may carry a pattern."""
+    """Return sampled lines of an (n, h, w) stack of which any image may carry a pattern."""
     return sample_frames(stack, list(range(len(stack))))
 
 
 class BlockReader:
-    """Levels (n, p) of the pixels that vary: -1 the darkest of all images, 1 the brightest."""
+    """Reader of the normalised levels (n, p) of the pixels that vary: -1 the darkest of all images, 1 the brightest."""
 
     def __init__(self, sample: LineSample) -> None:
+        """Select the pixels of ``sample`` that vary, and normalise their levels."""
         high, low = sample.frames.max(axis=0), sample.frames.min(axis=0)
         swing = high - low
         self.illuminated = swing > sample.least_swing
@@ -131,15 +142,18 @@ class BlockReader:
 
     @property
     def count(self) -> int:
-        """Number of sampled pixels."""
+        """Number of sampled pixels that vary."""
         return self.levels.shape[1]
 
     def phasor(self, images: tuple[int, ...]) -> np.ndarray:
-        """(p,) complex64, for a phase that rises with the step."""
+        """Fit modulation * e^(i phase), (p,) complex64, to images that are equidistant steps.
+
+        The phase rises with the step.
+        """
         return _fit_phasor(self.levels[list(images)])
 
     def run(self, images: tuple[int, ...]) -> PhaseRun | None:
-        """The images as all steps of one period; None where they are not."""
+        """Return the images as a run of all steps of one period; None if they are not."""
         rows = list(images)
         if float(self._in_middle[rows].mean()) < MIN_MIDDLE or not _is_cosine(self._coarse[rows], COARSE):
             return None
@@ -170,7 +184,7 @@ class BlockReader:
         return Bit(image, inverse, (float(x), float(y)), int(edge.sum()), float(decided.mean()) > READABLE, even)
 
     def are_opposite(self, first: int, second: int) -> bool:
-        """Whether one image is the inverse of the other."""
+        """Return whether one image is the inverse of the other."""
         a, b = self.levels[first], self.levels[second]
         decided = (np.abs(a) > DECIDED) & (np.abs(b) > DECIDED)
         if decided.mean() > READABLE:
@@ -181,7 +195,7 @@ class BlockReader:
 
 
 def _is_cosine(levels: np.ndarray, tolerance: float = 1.0) -> bool:
-    """Whether levels (n, p) are n steps of a cosine of many phases, within ``tolerance`` times the limits."""
+    """Return whether levels (n, p) are n steps of a cosine of many phases, within ``tolerance`` times the limits."""
     if float(np.std(levels.mean(axis=0))) > MAX_SPREAD * tolerance:
         return False
     phasor = _fit_phasor(levels)
@@ -192,7 +206,7 @@ def _is_cosine(levels: np.ndarray, tolerance: float = 1.0) -> bool:
 
 
 def _fit_phasor(levels: np.ndarray) -> np.ndarray:
-    """(p,) complex64 of levels (n, p), for a phase that rises with the step."""
+    """Fit modulation * e^(i phase), (p,) complex64, to levels (n, p), for a phase that rises with the step."""
     n = len(levels)
     angle = 2 * np.pi * np.arange(n) / n
     cosine, sine = (np.stack([np.cos(angle), np.sin(angle)]) * (2 / n)).astype(np.float32) @ levels
@@ -202,7 +216,7 @@ def _fit_phasor(levels: np.ndarray) -> np.ndarray:
 
 
 def _measure_misfit(levels: np.ndarray, phasor: np.ndarray) -> float:
-    """rms of what a cosine leaves of levels (n, p), in parts of its median amplitude."""
+    """Return the rms residual of a cosine fitted to levels (n, p), as a share of its median amplitude."""
     angle = 2 * np.pi * np.arange(len(levels)) / len(levels)
     waves = np.stack([np.cos(angle), -np.sin(angle)], axis=1).astype(np.float32)
     residual = levels - levels.mean(axis=0) - waves @ np.stack([phasor.real, phasor.imag])
@@ -210,8 +224,8 @@ def _measure_misfit(levels: np.ndarray, phasor: np.ndarray) -> float:
 
 
 def group_frames(reader: BlockReader) -> FrameBlocks:
-    """The images in blocks, in their order."""
-    runs = _find_phase_runs(reader)
+    """Group the images into runs of phase steps, Gray codes and even light."""
+    runs = _detect_phase_runs(reader)
     grouped_images = {image for run in runs for image in run.images}
     codes: list[GrayBlock] = []
     even: dict[int, Even] = {}
@@ -227,8 +241,8 @@ def group_frames(reader: BlockReader) -> FrameBlocks:
     return FrameBlocks(tuple(runs), tuple(codes), even, tuple(doubts))
 
 
-def _find_phase_runs(reader: BlockReader) -> list[PhaseRun]:
-    """Runs of successive images that are all steps of one period."""
+def _detect_phase_runs(reader: BlockReader) -> list[PhaseRun]:
+    """Detect runs of successive images that are all steps of one period."""
     runs, start, count = [], 0, len(reader.levels)
     while start < count:
         fitting = [
@@ -244,7 +258,10 @@ def _find_phase_runs(reader: BlockReader) -> list[PhaseRun]:
 
 
 def _pair_inverses(reader: BlockReader, images: list[int]) -> list[Bit]:
-    """Images of a segment one by one, or each with the inverse that follows, or that lies half a block later."""
+    """Return the bits of a segment, each with its inverse: the next image, or the one half a block later.
+
+    Images without an inverse are returned as single bits.
+    """
     bits = [reader.bit(image, None) for image in images]
     striped = [bit.image for bit in bits if bit.even is None]
     half = len(striped) // 2
@@ -269,7 +286,7 @@ def _pair_inverses(reader: BlockReader, images: list[int]) -> list[Bit]:
 def _split_segment(
     bits: list[Bit], codes: list[GrayBlock], even: dict[int, Even], doubts: list[tuple[tuple[int, ...], str]]
 ) -> None:
-    """Sort the images between two runs of phase steps into codes and even light."""
+    """Sort the images between two runs of phase steps into ``codes``, ``even`` and ``doubts``, in place."""
     striped = [bit for bit in bits if bit.even is None and bit.is_readable]
     rises = sum(b.count > a.count for a, b in pairwise(striped))
     is_reversed = 2 * rises < len(striped) - 1
@@ -277,8 +294,8 @@ def _split_segment(
     waiting: list[Bit] = []
     block: list[Bit] = []
 
-    def close() -> None:
-        """Add the current block of bits, and begin a new one."""
+    def close_block() -> None:
+        """Add the current block of bits to the codes, and begin a new one."""
         if block:
             _add_block(block, is_reversed, codes, doubts)
         block.clear()
@@ -289,17 +306,20 @@ def _split_segment(
             continue
         last = max((b.count for b in block if b.is_readable), default=0)
         if bit.is_readable and last > FEWEST_EDGES and bit.count < DROP * last:
-            close()
+            close_block()
         # Stripes grow finer within a code: what is even between two of its bits is a bit as well.
         block += waiting if block else _select_leading_bits(waiting, even, with_inverse)
         waiting = []
         block.append(bit)
-    close()
+    close_block()
     _record_even_images(waiting, even)
 
 
 def _select_leading_bits(waiting: list[Bit], even: dict[int, Even], with_inverse: bool) -> list[Bit]:
-    """Of the evenly illuminated images before a code, the most significant bits, which are 0 in all of the view."""
+    """Return the most significant bits, black throughout the view, among the evenly illuminated images before a code.
+
+    The other images are recorded in ``even``.
+    """
     leading: list[Bit] = []
     while waiting and waiting[-1].even == "black" and (waiting[-1].inverse is not None) == with_inverse:
         leading.insert(0, waiting.pop())
@@ -308,7 +328,7 @@ def _select_leading_bits(waiting: list[Bit], even: dict[int, Even], with_inverse
 
 
 def _record_even_images(bits: list[Bit], even: dict[int, Even]) -> None:
-    """Record which images are evenly white or black, inverses included."""
+    """Record in ``even`` which images are evenly white or black, inverses included."""
     for bit in bits:
         assert bit.even is not None
         even[bit.image] = bit.even
@@ -319,7 +339,7 @@ def _record_even_images(bits: list[Bit], even: dict[int, Even]) -> None:
 def _add_block(
     block: list[Bit], is_reversed: bool, codes: list[GrayBlock], doubts: list[tuple[tuple[int, ...], str]]
 ) -> None:
-    """Add successive bits as a Gray code, or the doubt why they are none."""
+    """Add successive bits to ``codes`` as a Gray code, or to ``doubts`` the reason why they are none."""
     images = tuple(sorted(image for bit in block for image in bit.images))
     paired = {bit.inverse is not None for bit in block}
     readable = [bit for bit in block if bit.is_readable and bit.even is None]

@@ -1,9 +1,9 @@
-"""The light of each frame of a capture: estimated from the frames themselves, and made equal.
+"""Light of each frame of a capture: estimated from the frames themselves, and equalized.
 
 Frame i shows ``g_i(v) S_i(p) + o_i(p)``: S_i is what the scene shows of its pattern; the gain g_i varies with automatic
-exposure and unsteady lamps, under a rolling shutter also along the image rows v; o_i is the light of the room that is
-more or less than in the other frames, uniform or in proportion to the scene's albedo. Of several models the simplest
-that explains the frames is taken; see `light_fit`.
+exposure and unsteady lamps, under a rolling shutter also along the image rows v; o_i is the room light in excess of
+that of the other frames, uniform or in proportion to the scene's albedo. Of several models the simplest one that
+explains the frames is selected; see `light_fit`.
 """
 
 from collections.abc import Iterator, Sequence
@@ -29,7 +29,7 @@ from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.fringe.suspect import Fault, Suspect
 
 LEAST_GAIN = 0.005
-"""rms variation of the gains below which they are left alone: what a camera's curve and blur pretend at most."""
+"""rms variation of the gains below which they are not corrected: a camera's response and blur simulate at most this."""
 LEAST_OF_THREE = 0.02
 """The same of three steps, whose gains are known only as far as the scene's texture is independent of the fringes."""
 LEAST_CODED_GAIN = 0.045
@@ -37,36 +37,35 @@ LEAST_CODED_GAIN = 0.045
 LEAST_WAVE, LEAST_ROOM = 0.01, 0.03
 """rms of a wave along the rows, and change of the room's light over the mean grey level, that are corrected."""
 NOISE_PART = 0.25
-"""... and so is a variation below this part of the noise of a grey level, which adds 3 % to it."""
+"""A variation below this part of the noise of a grey level is not corrected either: it adds 3 % to the noise."""
 BETTER = 1.03
-"""Factor by which a wave along the rows or room light must lower the mean squared residual to be believed."""
+"""Factor by which a wave along the rows or room light must reduce the mean squared residual to be accepted."""
 AS_GOOD = 1.02
-"""Models within this factor of the best explain the frames as well: the first, simplest, is taken."""
+"""Models within this factor of the best explain the frames as well: the first, simplest, is selected."""
 LEFT, LEFT_CONTRAST = 4.0, 0.02
-"""Light explains the frames if the mean squared residual is below so many times the square of the grey levels by which
-neighbouring pixels differ, plus the square of this share of the contrast for what blur and the camera's curve add."""
+"""Light explains the frames if the mean squared residual is below ``LEFT`` times the squared roughness, plus the square
+of ``LEFT_CONTRAST`` times the contrast, for the effect of blur and the camera's response."""
 EXPLAINED = 0.6
-"""Of a Gray code alone it explains them if that is below this share of what equal light leaves: blur, scattered light
-and compression add to it. Of sound frames, and of those that show another's pattern, light explains up to a third."""
+"""For Gray code alone, light explains the frames if the residual is below this share of that of equal light: blur,
+scattered light and compression add to it. Light explains up to a third of sound frames, and of misplaced ones."""
 LEFT_OF_ROOM = 1.5
-"""... so many times where gains and room light together explain them: they have so many values that they can pretend to
-explain a frame out of its place."""
+"""``LEFT`` for gains and room light together: they have enough values to fit a misplaced frame as well."""
 ONE_FRAME = 6.0
-"""... and no frame has so many times the residual of the median frame: frames that show another's pattern have more."""
+"""Largest residual of a frame relative to the median frame: frames that show another's pattern have more."""
 LEFT_OF_FRAME = 0.3
-"""... unless, in a Gray code alone, light explains all but this share of what it leaves otherwise."""
+"""For Gray code alone, a larger residual is accepted below this share of the frame's residual in equal light."""
 CLEARLY_BETTER = 1.5
-"""Both factors where a Gray code alone leaves more than noise: some percent of it are blur and scattered light
+"""Both factors for Gray code alone whose residual exceeds noise: some percent of it are blur and scattered light
 that a wave along the rows, or room light, happens to fit."""
 CYCLES = np.arange(0.5, 8.25, 0.25)
 """Waves along the image's height that are tried."""
 FINE = 0.05
-"""A coded frame of which so few pixels lie inside a stripe has fine stripes throughout."""
+"""Share of pixels inside stripes below which a coded frame has fine stripes throughout."""
 REPORTED = 3.0
 """Percent of brightness, from the darkest to the brightest frame, that the operator should know about."""
 FEW_STEPS = 4
-"""Up to so many steps, a change of room light between them is not corrected reliably: on a textured board in four steps
-light of a quarter of the mean left 1.4 px where it was taken for uniform."""
+"""Largest number of steps between which a change of room light is not corrected reliably: with four steps on a textured
+board, light of a quarter of the mean caused an error of 1.4 px when modelled as uniform."""
 FARTHEST = 0.7
 """Logarithm of a gain beyond which a frame shows something else."""
 CLIPPED = 65535.0
@@ -82,11 +81,12 @@ MODELS: tuple[tuple[Term, ...], ...] = (
 
 @dataclass(frozen=True, eq=False)
 class FrameLight:
-    """The light of each of n frames, relative to their mean; `terms` is empty where it need not, or cannot, be
-    corrected: `unexplained` are the terms by which frames differ, though they explain too little of what is seen.
+    """Light of each of n frames, relative to their mean.
 
-    ``drift``: rms of the gains' logarithm; ``wave``: rms amplitude of the wave along the rows, relative; ``room``
-    (n,): room light of each frame as a share of the mean grey level, from 0 on.
+    ``terms``: terms of the light that are to be corrected, empty where no correction is necessary or possible;
+    ``unexplained``: terms by which the frames differ, although these explain too little to be corrected. ``drift``: rms
+    of the gains' logarithm; ``wave``: rms amplitude of the wave along the rows, relative; ``room`` (n,): room light of
+    each frame as a share of the mean grey level, from 0 on.
     """
 
     light: Light
@@ -98,15 +98,15 @@ class FrameLight:
 
     @property
     def is_significant(self) -> bool:
-        """Whether the frames differ by more than can be neglected."""
+        """Whether the light differs between the frames by more than can be neglected."""
         return bool(self.terms)
 
 
 def estimate_frame_light(sequence: PatternSequence, stack: np.ndarray) -> FrameLight:
-    """The light of the frames (n, h, w) uint8 or uint16 of a capture, from all of them together.
+    """Estimate the light of the frames (n, h, w) uint8 or uint16 of a capture, from all of them together.
 
-    A small sample decides first whether there is anything to estimate. Frames of which nothing is known keep gain 1.
-    Raises InputError when the frames are not those of the sequence.
+    A small sample decides first whether there is anything to estimate. Frames that cannot be judged have gain 1. Raises
+    InputError when the frames are not those of the sequence.
     """
     check_stack(sequence, stack)
     steady = FrameLight(Light.constant(len(stack)), ())
@@ -117,7 +117,7 @@ def estimate_frame_light(sequence: PatternSequence, stack: np.ndarray) -> FrameL
     if sample is None:
         return steady
     fit = fit_light(sample, ("gain",), Light.constant(len(stack)))
-    if np.ptp(np.log(fit.light.gain)) > 0.2 and sample.coded:  # bits and inverses can now be told apart better
+    if np.ptp(np.log(fit.light.gain)) > 0.2 and sample.coded:  # bits and inverses are now separated better
         sample = sample_light(sequence, stack, fit.light.gain) or sample
         coarse = sample_light(sequence, stack, fit.light.gain, coarse=True) or coarse
         fit = fit_light(sample, ("gain",), fit.light)
@@ -125,7 +125,7 @@ def estimate_frame_light(sequence: PatternSequence, stack: np.ndarray) -> FrameL
     fit = _choose_model(coarse, sample, gains)
     if fit is not gains and not _needs_correction(sample, fit):
         fit = gains
-    if not _explains(sample, fit):
+    if not _explains_frames(sample, fit):
         return replace(steady, unexplained=fit.terms if _explains_most(sample, fit) else ())
     light = _estimate_fine_stripes(sample, _fill_unknown_frames(sample, fit))
     used = list(fit.informed)
@@ -140,7 +140,7 @@ def equalize_frames(
 ) -> tuple[np.ndarray, float]:
     """Scale frames to equal light: (k, h, w) uint16, and the factor by which grey levels were multiplied.
 
-    ``frames``: indices of those that are wanted, all if None. Phase-shifted frames are 65535 throughout at pixels that
+    ``frames``: indices of the frames to scale, all if None. Phase-shifted frames are 65535 throughout at pixels that
     the camera clipped in one of the frames of their period, and nowhere else. Room light is added to the frames that
     lack it rather than subtracted, so that nothing becomes negative.
     """
@@ -177,9 +177,10 @@ def equalize_frames(
 def equalize_axis(
     sequence: PatternSequence, stack: np.ndarray, axis: Axis, light: FrameLight | None = None
 ) -> tuple[PatternSequence, np.ndarray, float]:
-    """The frames that an axis needs under equal light, their sequence, and the factor of their grey levels.
+    """Return the sequence and the frames of one axis under equal light, and the factor of their grey levels.
 
-    Sequence and stack as they are, and 1, where the light needs no correction. ``light``: estimated if None.
+    Sequence and stack are returned unchanged, with the factor 1, where the light needs no correction. ``light``:
+    estimated if None.
     """
     light = light or estimate_frame_light(sequence, stack)
     if not light.is_significant:
@@ -192,13 +193,16 @@ def equalize_axis(
 def restore_levels(
     modulation: np.ndarray, background: np.ndarray, noise: tuple[float, float], factor: float
 ) -> tuple[np.ndarray, np.ndarray, tuple[float, float]]:
-    """Modulation, background and noise (a, b) of equalized frames in the grey levels of the capture."""
+    """Convert modulation, background and noise (a, b) of equalized frames to the grey levels of the capture."""
     per_level = np.float32(1 / factor)
     return modulation * per_level, background * per_level, (noise[0] / factor**2, noise[1] / factor)
 
 
 def describe_disturbance(terms: Sequence[Term]) -> tuple[Fault, str]:
-    """What differs between frames whose light has these ``terms``, by more than can be corrected, and what to do."""
+    """Return the fault that these ``terms`` of the light stand for, and the message: what differs, and what to do.
+
+    The message is for light that differs by more than can be corrected.
+    """
     if "wave" in terms:
         return "flicker", (
             "the light varies along the image rows and between the frames by more than can be corrected (lamps or a "
@@ -217,7 +221,7 @@ def describe_disturbance(terms: Sequence[Term]) -> tuple[Fault, str]:
 
 
 def detect_light_faults(sequence: PatternSequence, light: FrameLight) -> list[Suspect]:
-    """What the operator should know about the light of the frames, and change."""
+    """Return a suspect for each variation of the light that the operator should correct."""
     out = []
     used = [i for i, f in enumerate(sequence.frames) if f.kind != "texture"]
     gain = light.light.gain[used]
@@ -239,7 +243,7 @@ def detect_light_faults(sequence: PatternSequence, light: FrameLight) -> list[Su
         for k in light.light.changes:
             change = 100 * float(light.room[k] - light.room[k - 1])
             more = "brighter" if change > 0 else "darker"
-            steps = _few_steps_across(sequence, k)
+            steps = _count_steps_across_change(sequence, k)
             outcome = (
                 f"between {steps} phase steps this cannot be corrected reliably; capture again in constant room light"
                 if steps
@@ -253,9 +257,12 @@ def detect_light_faults(sequence: PatternSequence, light: FrameLight) -> list[Su
     return out
 
 
-def _few_steps_across(sequence: PatternSequence, k: int) -> int:
-    """The phase steps of the period between whose frames frame k lies, where they are too few to tell light that is
-    uniform from light in proportion to the albedo; else 0."""
+def _count_steps_across_change(sequence: PatternSequence, k: int) -> int:
+    """Return the number of phase steps of the period during which the light changes before frame ``k``.
+
+    0 if there is no such period, or if it has enough steps to separate uniform light from light in proportion to the
+    albedo.
+    """
     for _, steps in (shift for axis in sequence.axes for shift in sequence.phase_shifts(axis)):
         if len(steps) <= FEW_STEPS and min(steps) < k <= max(steps):
             return len(steps)
@@ -263,7 +270,7 @@ def _few_steps_across(sequence: PatternSequence, k: int) -> int:
 
 
 def _is_light_varying(sample: LightSample) -> bool:
-    """Whether one step of any model, on a small sample, promises enough."""
+    """Return whether one step of any model, on a small sample, promises a significant correction."""
     model, count = light_model(sample), len(sample.frames)
     if not model.informed:
         return False
@@ -278,7 +285,7 @@ def _is_light_varying(sample: LightSample) -> bool:
 
 
 def _list_candidate_models(sample: LightSample, gains: Fit) -> Iterator[tuple[tuple[Term, ...], Light]]:
-    """The models beside gains alone, each with the light to start from."""
+    """Yield the models besides gains alone, each with the light to start from."""
     constant = Light.constant(len(sample.frames))
     remainder = light_model(sample).eliminate(gains.light, gains.share, gains.weight)
     for terms in MODELS[1:]:
@@ -292,9 +299,10 @@ def _list_candidate_models(sample: LightSample, gains: Fit) -> Iterator[tuple[tu
 
 
 def _has_large_gains(sample: LightSample, fit: Fit) -> bool:
-    """Whether the gains vary by more than can be neglected among the steps of a period, or among the other frames.
+    """Return whether the gains vary significantly among the steps of a period, or among the other frames.
 
-    Only the former shift the phase. Of the latter, blurred stripes pretend some percent, and thresholds bear more.
+    Only the former shift the phase. The latter appear to vary by some percent where stripes are blurred, and thresholds
+    tolerate more.
     """
     used = list(fit.informed)
     level = float(np.mean(sample.frames[used]))
@@ -308,7 +316,7 @@ def _has_large_gains(sample: LightSample, fit: Fit) -> bool:
 
 
 def _needs_correction(sample: LightSample, fit: Fit) -> bool:
-    """Whether a wave along the rows, or a change of the room's light, is large enough to be corrected."""
+    """Return whether a wave along the rows, or a change of the room light, is large enough to be corrected."""
     light, used = fit.light, list(fit.informed)
     if "wave" in fit.terms and np.sqrt(np.mean(light.wave[used] ** 2)) > LEAST_WAVE:
         return True
@@ -317,13 +325,13 @@ def _needs_correction(sample: LightSample, fit: Fit) -> bool:
 
 
 def _compute_room_light(sample: LightSample, light: Light, used: Sequence[int]) -> np.ndarray:
-    """(n,) room light of each frame as a share of the mean grey level."""
+    """Return the room light (n,) of each frame as a share of the mean grey level."""
     albedo = float(np.mean(sample.albedo(light.changes)))
     return (light.uniform + light.albedo[:, 0] * albedo) / float(np.mean(sample.frames[list(used)]))
 
 
 def _choose_model(coarse: LightSample, sample: LightSample, first: Fit) -> Fit:
-    """The simplest model that explains the frames about as well as the best: chosen on a coarse sample."""
+    """Select the simplest model that explains the frames about as well as the best, on a coarse sample, and fit it."""
     weight = np.ones(coarse.frames.shape[1], np.float32)
     own = fit_light(coarse, ("gain",), first.light, weight, 2)
     fits = [own, *(fit_light(coarse, terms, start, weight, 3) for terms, start in _list_candidate_models(coarse, own))]
@@ -338,7 +346,7 @@ def _choose_model(coarse: LightSample, sample: LightSample, first: Fit) -> Fit:
 
 
 def _refine_wave(sample: LightSample, fit: Fit) -> Fit:
-    """The fit at the wave's own number of cycles, from three around it."""
+    """Refine the number of cycles of the wave by a parabola through the residuals of three fits."""
     tried = [fit]
     for step in (-0.12, 0.12):
         tried.append(fit_light(sample, fit.terms, replace(fit.light, cycles=fit.light.cycles + step), fit.weight, 2))
@@ -351,16 +359,16 @@ def _refine_wave(sample: LightSample, fit: Fit) -> Fit:
     return min(tried, key=lambda f: f.variance)
 
 
-def _estimate_strongest_wave(left: Remainder) -> float:
-    """Cycles per image height of the wave that the frames' light has along the rows."""
-    excess, rows = left.row_excess()
+def _estimate_strongest_wave(remainder: Remainder) -> float:
+    """Return the cycles per image height of the strongest wave that the residual light has along the rows."""
+    excess, rows = remainder.row_excess()
     excess = excess - excess.mean(axis=1, keepdims=True)
     power = [float(np.sum(np.abs(excess @ np.exp(-2j * np.pi * f * rows)) ** 2)) for f in CYCLES]
     return float(CYCLES[int(np.argmax(power))])
 
 
-def _explains(sample: LightSample, fit: Fit) -> bool:
-    """Whether what the light leaves is like noise: little, and as much in one frame as in another."""
+def _explains_frames(sample: LightSample, fit: Fit) -> bool:
+    """Return whether the residual of a fit is like noise: small, and similar in all frames."""
     if fit.terms == ("gain",) and not _has_large_gains(sample, fit):
         return False
     model = light_model(sample)
@@ -381,14 +389,17 @@ def _explains(sample: LightSample, fit: Fit) -> bool:
 
 
 def _explains_most(sample: LightSample, fit: Fit) -> bool:
-    """Whether the light removes a large part of what equal light leaves."""
+    """Return whether the light removes a large part of the residual that equal light has."""
     model, one = light_model(sample), np.ones_like(fit.weight)
     equal = model.eliminate(Light.constant(len(sample.frames)), SHARE_PRIOR[0], one).variance
     return model.eliminate(fit.light, fit.share, one).variance < EXPLAINED * equal
 
 
 def _fill_unknown_frames(sample: LightSample, fit: Fit) -> Fit:
-    """The fit, with the gain of the nearest frame, and the room light since its last change, of frames without own."""
+    """Return the fit with values for the frames that do not determine their own light.
+
+    Such a frame has the gain of the nearest frame, and the room light since its last change.
+    """
     light, known, used = fit.light, np.array(fit.informed), light_model(sample).used
     frames = np.arange(len(light.gain))
     nearest = known[np.argmin(np.abs(frames[:, None] - known), axis=1)]
@@ -405,10 +416,10 @@ def _fill_unknown_frames(sample: LightSample, fit: Fit) -> Fit:
 
 
 def _estimate_fine_stripes(sample: LightSample, fit: Fit) -> Light:
-    """The light, with gains of coded frames whose stripes are too fine to have an interior.
+    """Estimate the gains of coded frames whose stripes are too fine to have an interior, and return the light.
 
     Over many fine stripes the mean of each bit and of each inverse is the same share of white: about half, more or less
-    by what the camera's curve makes of blurred stripes, which all of them have in common.
+    by what the camera's response makes of blurred stripes, which all of them have in common.
     """
     model, light = light_model(sample), fit.light
     remainder = model.eliminate(light, fit.share, fit.weight)

@@ -1,4 +1,7 @@
-"""An order of the frames in which a capture fits its description: late, missing, repeated and exchanged images."""
+"""Search for an order of the frames in which a capture fits its description.
+
+Images may be late, missing, repeated or exchanged.
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -18,17 +21,21 @@ from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.fringe.suspect import Suspect
 
 NAMED_BY_STEPS = 0.5
-"""What a hypothesis gains that the phase steps name by themselves."""
+"""Score added to a hypothesis that the phase steps alone suggest as well."""
 
 COARSE_MARGIN = 0.15
-"""By which the lengths of mean unit vectors may differ between a sample and a small part of it."""
+"""Tolerance of the length of a mean unit vector between a sample and a small part of it."""
 
 Images = tuple[int | None, ...]
 
 
 @dataclass(frozen=True)
 class _StepFindings:
-    """What the phase steps of one period say about their own order; ``strange``: where none is misplaced."""
+    """Findings about the order of the phase steps of one period.
+
+    ``order``: step of each frame where these are permuted, else None; ``misplaced``: frames that show another step;
+    ``strange``: frames that no step explains, judged only where none is misplaced.
+    """
 
     order: list[int] | None
     misplaced: list[Suspect]
@@ -36,14 +43,18 @@ class _StepFindings:
 
 
 class StepReader:
-    """Compares the phase steps of a sample with a cosine through all of them, once for each order of their images."""
+    """Checks the phase steps of a sample against a fitted cosine, cached for each order of their images."""
 
     def __init__(self, sequence: PatternSequence, sample: LineSample) -> None:
+        """Check the phase steps of ``sequence`` at the pixels of ``sample``."""
         self._sequence, self._sample = sequence, sample
         self._cached_findings = cache(self._judge_period)
 
     def detect_misplaced_steps(self, axis: Axis, images: Images | None = None) -> list[Contradiction]:
-        """Phase steps out of order, by what a cosine through all of them leaves."""
+        """Return the contradictions of phase steps that are out of order, from the residual of the fitted cosine.
+
+        ``images``: image of each frame, None for a missing one; the described order if omitted.
+        """
         out = []
         causes = {"late": "duplicate-frame", "dropped": "missing-frame", "lag": "frame-lag"}
         for findings in self._judge_axis(axis, images):
@@ -61,12 +72,12 @@ class StepReader:
         return out
 
     def detect_unexplained_steps(self, images: Images | None = None) -> set[int]:
-        """Frames that neither a step of their period explains, nor one with a share of the image before it."""
+        """Return the frames that no step of their period explains, with or without a share of the image before."""
         findings = (f for axis in self._sequence.axes for f in self._judge_axis(axis, images))
         return {suspect.frame for each in findings for suspect in each.strange}
 
     def _judge_axis(self, axis: Axis, images: Images | None) -> Iterator[_StepFindings]:
-        """The findings of each period all of whose steps are there, and see fringes."""
+        """Yield the findings of each period whose steps are all present and whose fringes are in view."""
         count = len(self._sample.lines)
         images = tuple(range(count)) if images is None else images
         for period, steps in self._sequence.phase_shifts(axis):
@@ -79,7 +90,7 @@ class StepReader:
                 yield findings
 
     def _judge_period(self, shift: Shift, first: int, seen: tuple[int, ...]) -> _StepFindings | None:
-        """The findings of one period, image ``seen[i]`` in the place of frame ``first + i``; None without fringes."""
+        """Return the findings of one period, image ``seen[i]`` shown as frame ``first + i``; None without fringes."""
         lines, white = self._sample.lines, self._sample.white
         images = [*range(first), *seen, *range(first + len(seen), len(lines))]
         sampled = sample_fringe(lines[images], shift, (0.0, 0.0), white)
@@ -96,20 +107,20 @@ class StepReader:
 def detect_copies(
     sequence: PatternSequence, readers: dict[Axis, AxisReader], likeness: FrameLikeness
 ) -> tuple[Contradiction, ...]:  # fmt: skip
-    """Images that are another once more, if all tests are passed without them."""
+    """Return the contradictions of images that repeat another one; empty unless all tests pass without them."""
     pairs = likeness.repeated()
     if not pairs:
         return ()
     for which in (0, 1):  # the later image of each pair is the copy, or the earlier
         lost = {pair[which]: pair[1 - which] for pair in pairs}
         images = tuple(None if i in lost else i for i in range(len(sequence.frames)))
-        if _score(sequence, readers, likeness, images) is not None:
+        if _score_order(sequence, readers, likeness, images) is not None:
             return tuple(_describe_duplicate(sequence, i, j) for i, j in lost.items())
     return ()
 
 
 def _describe_duplicate(sequence: PatternSequence, i: int, j: int) -> Contradiction:
-    """The contradiction of frame i that repeats the pattern of frame j."""
+    """Return the contradiction of frame ``i`` that repeats the pattern of frame ``j``."""
     text = f"frame {i + 1} shows the pattern of frame {j + 1}: it is late or repeated; capture again"
     return Contradiction("duplicate-frame", text, sequence.frames[i].axis, float(i))
 
@@ -121,14 +132,17 @@ def search_order(
     likeness: FrameLikeness,
     disordered: list[Contradiction],
 ) -> Answer | None:
-    """The order of the frames in which all tests are passed best; None if there is none. ``disordered``: what the phase
-    steps alone say.
+    """Search the order of the frames that passes all tests best.
+
+    Return its contradiction and score, None if none passes.
+
+    ``disordered``: contradictions of the phase steps alone; an order that agrees with them is preferred.
     """
     named_by_steps = {(contradiction.cause, contradiction.value) for contradiction in disordered}
     passed: list[Answer] = []
     orders: list[Images] = []
-    for images, contradiction, penalty in _orders(sequence):
-        score = _score(sequence, readers, likeness, images)
+    for images, contradiction, penalty in _list_orders(sequence):
+        score = _score_order(sequence, readers, likeness, images)
         if score is not None:
             score += NAMED_BY_STEPS * ((contradiction.cause, contradiction.value) in named_by_steps) - penalty
             orders.append(images)
@@ -145,10 +159,13 @@ def search_order(
     return None
 
 
-def _score(
+def _score_order(
     sequence: PatternSequence, readers: dict[Axis, AxisReader], likeness: FrameLikeness, images: Images
 ) -> float | None:  # fmt: skip
-    """How well the images agree in this order; None where a test fails, or none has anything to show for itself."""
+    """Return the sum of the agreement shares of all axes in this order of the images.
+
+    None if a test fails, or if no axis gives positive evidence for the order.
+    """
     if not all(map(likeness.is_even, range(len(images)), images)):
         return None
     described = {axis: described_frames(sequence, axis, images) for axis in sequence.axes}
@@ -156,28 +173,30 @@ def _score(
         _is_refuted(readers[axis], frames) and readers[axis].is_in_view(frames) for axis, frames in described.items()
     ):
         return None
-    score, sure = 0.0, False
+    score, is_any_supported = 0.0, False
     for axis, frames in described.items():
         a = measure_agreement(readers[axis], frames)
         if failed_tests(frames, a) or not (is_supported(frames, a) or _lacks_steps(frames)):
             if readers[axis].is_in_view(frames):
                 return None
             continue
-        sure |= is_supported(frames, a)
+        is_any_supported |= is_supported(frames, a)
         score += sum_shares(a)
-    return score if sure else None
+    return score if is_any_supported else None
 
 
 def _is_refuted(reader: AxisReader, frames: AxisFrames) -> bool:
-    """Whether the Gray code alone, or the levels of a small part of the sample, fail a test for certain: at a fraction
-    of the time that all tests take, it is true of most orders."""
+    """Return whether the Gray code alone, or the levels of a small part of the sample, certainly fail a test.
+
+    This takes a fraction of the time that all tests take, and excludes most orders.
+    """
     if frames.bits:
         a = measure_code_agreement(reader, frames)
         return bool(failed_tests(frames, a)) or not is_supported(frames, a)
     return min(measure_agreement(reader.coarse, frames).level_common, default=1.0) < SURE - COARSE_MARGIN
 
 
-def _orders(sequence: PatternSequence) -> Iterator[tuple[Images, Contradiction, float]]:
+def _list_orders(sequence: PatternSequence) -> Iterator[tuple[Images, Contradiction, float]]:
     """Yield hypotheses of the frame order, the simplest first: lag, exchange, repetition, or a missing frame.
 
     Each is (image of each frame, None for a missing one; the contradiction to report; a penalty).
@@ -217,5 +236,5 @@ def _orders(sequence: PatternSequence) -> Iterator[tuple[Images, Contradiction, 
 
 
 def _lacks_steps(frames: AxisFrames) -> bool:
-    """Whether too many steps are missing to compare its periods."""
+    """Return whether so many steps are missing that the periods of an axis cannot be compared."""
     return not frames.bits and any(sum(image is not None for image in images) < 3 for _, images in frames.shifts)

@@ -1,7 +1,7 @@
-"""A share of the image before in each frame: a display that answers slowly, an exposure across the change of patterns.
+"""Ghosting, a share of the previous image in each frame: from a slow display, or an exposure across a pattern change.
 
 Within a series of phase steps a ghost of the step before shifts all phases alike, and nothing contradicts it. The first
-step of a series holds a ghost of another pattern, and there it is measured.
+step of a series contains a ghost of another pattern, and there it is measured.
 """
 
 import numpy as np
@@ -10,17 +10,17 @@ from slviewer.fringe.residual_sample import Fringe
 from slviewer.fringe.suspect import Suspect
 
 LEAST_SHARE = 0.01
-"""Of the image before: less shifts the phase of eight steps by under 0.01 rad."""
+"""Smallest share of the previous image: a smaller one shifts the phase of eight steps by less than 0.01 rad."""
 MOST_SHARE = 0.5
-"""More is a frame that is late."""
+"""Largest share of the previous image: with more, the frame is late."""
 MOSTLY = 0.5
-"""Part of what light and ghost explain together, that the ghost alone must add."""
+"""Share of the residual explained by light and ghost together that the ghost alone must contribute."""
 SIGMAS = 10.0
-"""Of its standard error, which tens of thousands of pixels make small: what blur and noise pretend lies below."""
+"""Smallest share in multiples of its standard error, which many pixels make small: blur and noise give less."""
 
 
 def measure_ghost_share(sampled: Fringe) -> tuple[float, float]:
-    """The share of the image before in each image, and its standard error, from the first step of a period.
+    """Measure the share of the previous image in each image, and its standard error, from the first step of a period.
 
     NaN where three steps fit anything, or where frames of other light explain the residuals as well. Before the very
     first frame of a capture there is none, and it alone lacks its share.
@@ -31,7 +31,7 @@ def measure_ghost_share(sampled: Fringe) -> tuple[float, float]:
     projection = sampled.keep
     residuals = projection.astype(np.float32) @ sampled.frames
     # The first step is off by the share of what the image before differs from the last step; and frames of other light
-    # are not taken for a ghost: their gains are fitted together with it.
+    # do not count as a ghost: their gains are fitted together with it.
     regressors = np.concatenate([sampled.fitted, (before - sampled.fitted[-1])[None]])
     steps = [*range(sampled.steps), 0]
     normal = projection[np.ix_(steps, steps)] * (regressors @ regressors.T)
@@ -48,7 +48,7 @@ def measure_ghost_share(sampled: Fringe) -> tuple[float, float]:
 
 
 def detect_ghosting(sampled: Fringe) -> list[Suspect]:
-    """The first step of a period, where it holds a share of the image before it."""
+    """Return a suspect for the first step of a period if it contains a share of the image before it; else empty."""
     share, error = measure_ghost_share(sampled)
     if not (LEAST_SHARE < share < MOST_SHARE and share > SIGMAS * error):
         return []

@@ -1,4 +1,4 @@
-"""A description of a capture from its images alone, with what supports it and what stays open."""
+"""Guess of the description of a capture from its images alone, with the evidence and the open questions."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -18,9 +18,9 @@ from slviewer.fringe.sequence import Axis, Frame, PatternSequence, PerAxis
 ASSUMED_PX = 16.0
 """px of the finest period where nothing states it: a scale, and no measurement."""
 DIAGONAL = (0.67, 1.5)
-"""Slopes of stripes that are within 11 degrees of a diagonal, from which no axis can be told."""
+"""Slopes of stripes within 11 degrees of a diagonal, which determine no axis."""
 WHOLE = 0.02
-"""Part of a number by which a measured ratio may be off a whole one: its uncertainty over some ten fringes is less."""
+"""Tolerance of a measured ratio that should be a whole number: its uncertainty over some ten fringes is less."""
 SAME_PERIOD = 0.05
 TURN = 2 * np.pi
 WINDOW = 24
@@ -30,9 +30,12 @@ FINEST_PX = 2.0
 
 @dataclass(frozen=True)
 class Guess:
-    """``sequence``: the frames in the order of the images, None where some image stays open. ``frames``: what each
-    image shows, None where that is open. ``evidence``: (first image, text). ``doubts``: (images, text); empty where the
-    description is sure up to what ``notes`` say: assumptions that the images cannot confirm."""
+    """Guessed description of a capture.
+
+    ``sequence``: the frames in the order of the images, None where some image is not identified. ``frames``: content of
+    each image, None where it is not identified. ``evidence``: (first image, text). ``doubts``: (images, text); empty
+    where the description is certain up to ``notes``: assumptions that the images cannot confirm.
+    """
 
     sequence: PatternSequence | None
     frames: tuple[Frame | None, ...]
@@ -50,11 +53,11 @@ class _AxisBlocks:
 
 
 def guess_sequence(stack: np.ndarray, projector: tuple[int, int] | None = None) -> Guess:
-    """What the images of an (n, h, w) uint8 or uint16 stack show, in the order of the capture.
+    """Guess the frames that the images of an (n, h, w) uint8 or uint16 stack show, in the order of the capture.
 
     ``projector``: (width, height) px where it is known. Periods in projector px follow from the images only where Gray
-    code numbers the projector's pixels; else ratios alone do, and the finest period is given 16 px. Raises InputError
-    for a stack that is none.
+    code numbers the projector's pixels; else only their ratios do, and the finest period is set to 16 px. Raises
+    InputError for an array that is no stack.
     """
     if stack.ndim != 3 or len(stack) < 3:
         raise InputError(f"a stack of shape {stack.shape} is no capture: give three or more images of one size")
@@ -74,7 +77,10 @@ def guess_sequence(stack: np.ndarray, projector: tuple[int, int] | None = None) 
 
 
 def _assign_axes(blocks: FrameBlocks, doubts: list[tuple[tuple[int, ...], str]]) -> dict[Axis, _AxisBlocks]:
-    """Blocks by the direction of their stripes: x for stripes that are rather upright in the camera."""
+    """Assign the blocks to axes by the direction of their stripes: x for stripes that are rather upright in the camera.
+
+    Adds to ``doubts`` stripes that are nearly diagonal, equal periods, and several codes of one axis.
+    """
     runs: dict[Axis, list[PhaseRun]] = {"x": [], "y": []}
     codes: dict[Axis, list[GrayBlock]] = {"x": [], "y": []}
     every: list[PhaseRun | GrayBlock] = [*blocks.runs, *blocks.codes]
@@ -90,9 +96,9 @@ def _assign_axes(blocks: FrameBlocks, doubts: list[tuple[tuple[int, ...], str]])
             codes[axis].append(block)
     out: dict[Axis, _AxisBlocks] = {}
     for axis in ("x", "y"):
-        ordered = sorted(runs[axis], key=_fringe_frequency)
+        ordered = sorted(runs[axis], key=_compute_fringe_frequency)
         for a, b in pairwise(ordered):
-            if _fringe_frequency(b) < (1 + SAME_PERIOD) * _fringe_frequency(a):
+            if _compute_fringe_frequency(b) < (1 + SAME_PERIOD) * _compute_fringe_frequency(a):
                 doubts.append((a.images + b.images, f"two runs of phase steps of axis {axis} have the same period"))
         if len(codes[axis]) > 1:
             images = tuple(image for code in codes[axis] for image in code.images)
@@ -102,8 +108,8 @@ def _assign_axes(blocks: FrameBlocks, doubts: list[tuple[tuple[int, ...], str]])
     return out
 
 
-def _fringe_frequency(run: PhaseRun) -> float:
-    """Phase gradient, rad per camera px."""
+def _compute_fringe_frequency(run: PhaseRun) -> float:
+    """Return the phase gradient of a run, rad per camera px."""
     return float(np.hypot(*run.gradient))
 
 
@@ -116,7 +122,10 @@ def _propose_sequence(
     doubts: list[tuple[tuple[int, ...], str]],
     projector: tuple[int, int] | None,
 ) -> Guess:
-    """The proposed sequence with the evidence for each of its entries."""
+    """Return the guess for blocks that are assigned to axes, with its evidence, doubts and notes.
+
+    ``sequence`` is None if some image is not identified. ``projector``: (width, height) px, None where it is not known.
+    """
     frames: list[Frame | None] = [None] * len(stack)
     evidence: list[tuple[int, str]] = []
     notes: list[str] = []
@@ -125,7 +134,7 @@ def _propose_sequence(
         frames[image] = Frame(kind if kinds == {"white", "black"} else "texture" if kind == "white" else "black")
         evidence.append((image, f"evenly {'bright' if kind == 'white' else 'dark'}"))
     for axis, parts in axes.items():
-        ratios = [_ratio(reader, parts.runs[-1], run) for run in parts.runs]
+        ratios = [_measure_period_ratio(reader, parts.runs[-1], run) for run in parts.runs]
         _add_frames(axis, parts, ratios, frames, evidence)
     open_images = tuple(i for i, frame in enumerate(frames) if frame is None)
     if open_images and not any(set(open_images) & set(images) for images, _ in doubts):
@@ -137,19 +146,19 @@ def _propose_sequence(
     except InputError as error:
         return Guess(None, tuple(frames), tuple(evidence), ((tuple(range(len(frames))), str(error)),), ())
     for axis in sequence.axes:
-        sequence = _with_conventions(sequence, axis, axes[axis], sample, reader, evidence, doubts, notes)
+        sequence = _apply_conventions(sequence, axis, axes[axis], sample, reader, evidence, doubts, notes)
     if not doubts:
         everything = tuple(range(len(frames)))
         doubts += [(everything, contradiction.message) for contradiction in check_description(sequence, stack)]
     if not doubts:
         for axis in sequence.axes:
-            sequence = _with_scale(sequence, axis, sample, projector, doubts, notes)
+            sequence = _scale_to_projector(sequence, axis, sample, projector, doubts, notes)
         sequence = replace(sequence, projector_size=projector)
     return Guess(sequence, sequence.frames, tuple(sorted(evidence)), tuple(doubts), tuple(notes))
 
 
-def _ratio(reader: BlockReader, finest: PhaseRun, run: PhaseRun) -> float:
-    """Of a run's period to the finest: by how much their phases change over the same pixels."""
+def _measure_period_ratio(reader: BlockReader, finest: PhaseRun, run: PhaseRun) -> float:
+    """Return the ratio of a run's period to the finest, from the change of their phases over the same pixels."""
     if run is finest:
         return 1.0
     fine, coarse = (reader.phasor(each.images) for each in (finest, run))
@@ -163,19 +172,23 @@ def _ratio(reader: BlockReader, finest: PhaseRun, run: PhaseRun) -> float:
     order = np.argsort(slope)
     total = np.cumsum(weight[order])
     rough = 1 / max(float(slope[order][np.searchsorted(total, total[-1] / 2)]), 1e-6)
-    return _refined_ratio(fine, coarse, rough)
+    return _refine_period_ratio(fine, coarse, rough)
 
 
-def _refined_ratio(fine: np.ndarray, coarse: np.ndarray, rough: float) -> float:
-    """The ratio near ``rough`` at which the coarse phase, cut where no pixel has it, predicts the fine one best."""
-    cut = _empty_part(coarse)
+def _refine_period_ratio(fine: np.ndarray, coarse: np.ndarray, rough: float) -> float:
+    """Refine the ratio ``rough`` of two periods: at the result the coarse phase predicts the fine one best.
+
+    ``fine``, ``coarse`` (p,): phasors. The coarse phase is cut where no pixel has it; without such a phase ``rough`` is
+    returned.
+    """
+    cut = _detect_empty_phase(coarse)
     if cut is None:
         return rough
     angle = (np.angle(coarse) - cut) % TURN
     span = float(np.quantile(angle, 0.99) - np.quantile(angle, 0.01)) / TURN
     reach = min(0.04, 0.4 / (rough * max(span, 0.05)) + 0.01)
     ratios = rough * np.linspace(1 - reach, 1 + reach, 401)
-    # From one ratio to the next all unit vectors turn on by the same angles.
+    # From one ratio to the next each unit vector rotates by the same angle.
     unit, step = np.exp(1j * (np.angle(fine) - ratios[0] * angle)), np.exp(1j * (ratios[0] - ratios[1]) * angle)
     lengths = []
     for _ in ratios:
@@ -184,8 +197,8 @@ def _refined_ratio(fine: np.ndarray, coarse: np.ndarray, rough: float) -> float:
     return float(ratios[int(np.argmax(lengths))])
 
 
-def _empty_part(phasor: np.ndarray) -> float | None:
-    """A phase (rad) that hardly a pixel has; None where all of the period is in view, and its orders are not known."""
+def _detect_empty_phase(phasor: np.ndarray) -> float | None:
+    """Return a phase (rad) that hardly any pixel has; None where all of the period is in view."""
     counts, ends = np.histogram(np.angle(phasor), bins=36, range=(-np.pi, np.pi))
     return None if counts.min() > 0.2 * counts.mean() else float(ends[int(np.argmin(counts))])
 
@@ -197,7 +210,10 @@ def _add_frames(
     frames: list[Frame | None],
     evidence: list[tuple[int, str]],
 ) -> None:
-    """Frames of one axis, with the finest period of ASSUMED_PX and no complementary bit yet."""
+    """Add the frames of one axis to ``frames`` and ``evidence``.
+
+    The finest period is ASSUMED_PX; no bit is marked as complementary yet. ``ratios``: of the periods to the finest.
+    """
     for run, ratio in zip(parts.runs, ratios, strict=True):
         n = len(run.images)
         period = float(f"{ASSUMED_PX * ratio:.5g}")
@@ -217,13 +233,13 @@ def _add_frames(
         if bit.inverse is not None:
             frames[bit.inverse] = Frame("inverse", axis, bit=number, bits=bits)
         share = f"{bit.edges[0 if axis == 'x' else 1]:.3g} edges per camera px"
-        seen = f"even in all of the view: bit {number} by its place" if bit.even else f"stripes, {share}"
+        observation = f"even in all of the view: bit {number} by its place" if bit.even else f"stripes, {share}"
         if not bit.is_readable:
-            seen = f"too fine to be read: bit {number} by its place alone"
-        evidence.append((bit.image, seen + (", and its inverse" if bit.inverse is not None else "")))
+            observation = f"too fine to be read: bit {number} by its place alone"
+        evidence.append((bit.image, observation + (", and its inverse" if bit.inverse is not None else "")))
 
 
-def _with_conventions(
+def _apply_conventions(
     sequence: PatternSequence,
     axis: Axis,
     parts: _AxisBlocks,
@@ -233,7 +249,11 @@ def _with_conventions(
     doubts: list[tuple[tuple[int, ...], str]],
     notes: list[str],
 ) -> PatternSequence:
-    """The complementary bit, the width of the Gray cells, sign and offset of the phase, as code and fringes have it."""
+    """Return the sequence with the conventions of one axis that follow from its code and fringes.
+
+    These are the complementary bit, the width of the Gray cells, and sign and offset of the phase. Adds to
+    ``evidence``, ``doubts`` and ``notes``.
+    """
     images = tuple(sorted(coded_frames(sequence, axis)))
     reader = AxisReader(sample, list(images))
     if parts.code is None:
@@ -243,7 +263,7 @@ def _with_conventions(
         if len(parts.runs) == 1:
             notes.append(f"axis {axis}: one period without Gray code gives a phase that is not absolute")
             return replace(sequence, relative=True)
-        if _empty_part(blocks_reader.phasor(parts.runs[0].images)) is None:
+        if _detect_empty_phase(blocks_reader.phasor(parts.runs[0].images)) is None:
             doubts.append(
                 (parts.runs[0].images, f"axis {axis}: its longest period repeats in the view: state period_px")
             )
@@ -300,7 +320,7 @@ def _with_conventions(
     return sequence
 
 
-def _with_scale(
+def _scale_to_projector(
     sequence: PatternSequence,
     axis: Axis,
     sample: LineSample,
@@ -308,7 +328,11 @@ def _with_scale(
     doubts: list[tuple[tuple[int, ...], str]],
     notes: list[str],
 ) -> PatternSequence:
-    """Projector px: the codes in view must lie inside the projector, and all codes, or the longest period, cover it."""
+    """Return the sequence with the periods of one axis scaled to projector px.
+
+    The codes in view must be inside the projector, and all codes, or the longest period, must cover it. Adds to
+    ``doubts`` and ``notes``.
+    """
     periods, bits = sequence.periods_px(axis), len(sequence.find("gray", axis))
     images = tuple(sequence.find("phase", axis) or sequence.find("gray", axis))
     if projector is None:
@@ -360,7 +384,7 @@ def _check_code(
 
 
 def _mark_complementary(sequence: PatternSequence, axis: Axis, image: int) -> PatternSequence:
-    """The sequence with one Gray image as the complementary bit."""
+    """Return the sequence with one Gray image as the complementary bit."""
     frames = []
     for index, frame in enumerate(sequence.frames):
         if index == image:
@@ -371,18 +395,18 @@ def _mark_complementary(sequence: PatternSequence, axis: Axis, image: int) -> Pa
     return replace(sequence, frames=tuple(frames))
 
 
-def _describe_reversal(axis: Axis, seen: str, other: str) -> str:
-    """Evidence of an axis that is reversed by a device turned by 180 degrees."""
+def _describe_reversal(axis: Axis, observation: str, other: str) -> str:
+    """Return the text of the doubt that an axis is reversed, by a device turned by 180 degrees or by ``other``."""
     side = "to the right" if axis == "x" else "downwards"
-    return f"axis {axis}: {seen} {side} in the camera: camera or projector is turned by half a turn, {other}"
+    return f"axis {axis}: {observation} {side} in the camera: camera or projector is turned by half a turn, {other}"
 
 
 def _name_lines(axis: Axis) -> str:
-    """What a coordinate of an axis counts: columns or rows."""
+    """Return what a coordinate of an axis counts: "columns" or "rows"."""
     return "columns" if axis == "x" else "rows"
 
 
 def _replace_axis(values: object, axis: Axis, value: float) -> PerAxis:  # type: ignore[type-arg]
-    """The pair of values with that of one axis replaced."""
+    """Return a pair of values with that of one axis replaced."""
     both = values if isinstance(values, PerAxis) else PerAxis(values, values)
     return both._replace(**{axis: value})

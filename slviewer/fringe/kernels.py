@@ -1,4 +1,4 @@
-"""The phase shift, compiled; `reference` is what it must agree with.
+"""Phase shift, compiled; `reference` is the definition that it must agree with.
 
 A row of the image at a time, so that sums and codes stay in the cache while each frame is read once. Loops over a row
 have no branches and no library calls: the compiler turns them into vector instructions.
@@ -27,12 +27,12 @@ HALF_PI, PI = np.float32(np.pi / 2), np.float32(np.pi)
 
 
 class Steps(NamedTuple):
-    """A phase shift's frames, four to a line: of (p, q, r, s) with weights a and b, a (p - r - q + s) is added to the
-    cosines' sum and b (p - r + q - s) to the sines'.
+    """Frames of a phase shift, four to a line, with the weights of their samples.
 
-    Steps k, n/2 - k, n/2 + k and n - k share their cosine and sine but for signs: one product serves four frames. The
-    first frame stands in where there are fewer. ``first``: its index; ``counted``: how often all frames are read.
-    ``turn_cosine`` and ``turn_sine``: of the phase offset, by which the sums are turned back.
+    Of a line (p, q, r, s) with weights a and b, a (p - r - q + s) is added to the cosines' sum and b (p - r + q - s) to
+    the sines'. Steps k, n/2 - k, n/2 + k and n - k share their cosine and sine but for signs: one product serves four
+    frames. The first frame stands in where there are fewer. ``first``: its index; ``counted``: how often all frames are
+    read. ``turn_cosine`` and ``turn_sine``: of the phase offset, by which the sums are rotated back.
     """
 
     frames: np.ndarray
@@ -46,8 +46,11 @@ class Steps(NamedTuple):
 
 
 class Shifts(NamedTuple):
-    """The `Steps` of all periods, longest first: of period i, lines ``starts[i]`` to ``starts[i + 1]``, and
-    entry i of ``first``, ``steps`` and ``counted``; the phase offset is that of all."""
+    """`Steps` of all periods, longest first.
+
+    Period i has the lines ``starts[i]`` to ``starts[i + 1]``, and entry i of ``first``, ``steps`` and ``counted``; the
+    phase offset is that of all.
+    """
 
     frames: np.ndarray
     cosines: np.ndarray
@@ -81,7 +84,10 @@ class Scale(NamedTuple):
 
 @numba.njit
 def arctan2(y, x):
-    """float32 arctangent without branches, good to 3e-7 rad (Abramowitz and Stegun, 4.4.49); 0 where both are 0."""
+    """Return the float32 arctangent of y / x in rad, computed without branches; 0 where both are 0.
+
+    Accurate to 3e-7 rad (Abramowitz and Stegun, 4.4.49).
+    """
     ax, ay = abs(x), abs(y)
     # np.divide: the operator would check for zero and raise, which no vector instruction can.
     a = np.divide(min(ax, ay), max(ax, ay) + np.float32(1e-30))
@@ -101,8 +107,10 @@ def arctan2(y, x):
 
 @numba.njit
 def prefetch_row(stack, frame, row):
-    """Have a frame's next row on its way while this one is worked on: the processor itself looks ahead in one or two
-    frames, not in twenty."""
+    """Prefetch the next row of a frame while this one is processed.
+
+    The processor itself prefetches one or two frames, not twenty.
+    """
     if row + 1 < stack.shape[1]:
         line = stack[frame, row + 1]
         for x in range(0, len(line), LINE_BYTES // stack.itemsize):
@@ -111,7 +119,7 @@ def prefetch_row(stack, frame, row):
 
 @numba.njit
 def combine_samples(a, b, c, d):
-    """Of the samples (p, q, r, s) of a line of `Steps`: their sum, p - r - q + s, p - r + q - s, and the largest."""
+    """Combine the samples (p, q, r, s) of a line of `Steps`: sum, p - r - q + s, p - r + q - s, and the largest."""
     ac, bd = subtract_fixed_width(to_signed(a), to_signed(c)), subtract_fixed_width(to_signed(b), to_signed(d))
     total = add_fixed_width(add_fixed_width(to_signed(a), to_signed(b)), add_fixed_width(to_signed(c), to_signed(d)))
     return total, subtract_fixed_width(ac, bd), add_fixed_width(ac, bd), max(max(a, b), max(c, d))
@@ -119,14 +127,14 @@ def combine_samples(a, b, c, d):
 
 @numba.njit
 def add_four(a, b, c, d, cos_a, sin_a):
-    """What the samples of a line add: to all samples, to the cosines and to the sines; and the largest."""
+    """Return what one line adds to the sums of samples, cosines and sines, and its largest sample."""
     total, even, odd, peak = combine_samples(a, b, c, d)
     return np.float32(total), cos_a * np.float32(even), sin_a * np.float32(odd), peak
 
 
 @numba.njit
 def add_eight(a, b, c, d, e, f, g, h, cos_a, sin_a, cos_e, sin_e):
-    """The same of two lines."""
+    """Return what two lines add to the sums of samples, cosines and sines, and their largest sample."""
     one, even, odd, peak = combine_samples(a, b, c, d)
     two, even_e, odd_e, peak_e = combine_samples(e, f, g, h)
     cosine = fma(cos_a, np.float32(even), cos_e * np.float32(even_e))
@@ -136,8 +144,11 @@ def add_eight(a, b, c, d, e, f, g, h, cos_a, sin_a, cos_e, sin_e):
 
 @numba.njit(inline="always")
 def sums_row(stack, shift, row, cosine, sine, total, peak):
-    """Sums of one image row's samples weighed by cosines and sines, of all samples as the `Steps` count them, and the
-    largest sample, of the frames' dtype."""
+    """Sum the samples of one image row, weighted by cosines and sines; also the sum of all samples and the largest one.
+
+    Fills ``cosine``, ``sine``, ``total`` (w,) float32, the last as the `Steps` count the samples, and ``peak`` (w,) of
+    the frames' dtype.
+    """
     width, lines = stack.shape[2], len(shift.cosines)
     for k in range(0, lines - 1, 2):  # two lines to a pass: the sums are read and written less often
         i, j = shift.frames[k], shift.frames[k + 1]
@@ -182,7 +193,10 @@ def sums_row(stack, shift, row, cosine, sine, total, peak):
 
 @numba.njit(inline="always")
 def shift_row(stack, shift, row, wrapped, modulation, background, peak):
-    """Wrapped phase, modulation, background and largest sample (of the frames' dtype) of one image row."""
+    """Compute wrapped phase, modulation, background and largest sample of one image row, (w,) each.
+
+    ``peak`` is of the frames' dtype, the others are float32.
+    """
     width, first = stack.shape[2], stack[shift.first, row]
     cosine, sine, total = np.empty(width, np.float32), np.empty(width, np.float32), np.empty(width, np.float32)
     sums_row(stack, shift, row, cosine, sine, total, peak)
@@ -196,13 +210,13 @@ def shift_row(stack, shift, row, wrapped, modulation, background, peak):
 
 @numba.njit
 def is_dark(modulation, background, scale):
-    """Whether the modulation is too small for the noise at this brightness."""
+    """Return whether the modulation is too small for the noise at this brightness."""
     return is_dark_squared(modulation * modulation, background, scale)
 
 
 @numba.njit
 def is_dark_squared(squared, background, scale):
-    """The same of the modulation's square."""
+    """Return whether the modulation, given as its square, is too small for the noise at this brightness."""
     sigmas = np.float32(scale.dark_sigmas)
     variance = np.float32(scale.noise_a) + np.float32(scale.noise_b) * background
     levels = np.float32(scale.dark_levels)
@@ -211,20 +225,23 @@ def is_dark_squared(squared, background, scale):
 
 @numba.njit
 def is_clipped(modulation, background, peak, scale):
-    """Whether the fringe reaches the white level, in a sample and as fitted: noise alone does not do both."""
+    """Return whether the fringe reaches the white level, in a sample and as fitted: noise alone does not do both."""
     return (np.float32(peak) >= np.float32(scale.white)) & (background + modulation >= np.float32(scale.white))
 
 
 @numba.njit
 def select_reason(dark, clipped, inconsistent):
-    """The first reason that applies: what is clipped in all its frames has no modulation, yet is not dark."""
+    """Return the first reason that applies to a pixel, SATURATED, DARK, INCONSISTENT or VALID.
+
+    A pixel that is clipped in all its frames has no modulation, yet is not dark.
+    """
     unclipped = DARK if dark else (INCONSISTENT if inconsistent else VALID)
     return SATURATED if clipped else unclipped
 
 
 @numba.njit(inline="always")
 def bit_height(stack, frames, inverses, bit, row, x, threshold):
-    """Grey levels by which a Gray bit lies above its threshold."""
+    """Return the grey levels by which a Gray bit is above its threshold."""
     value = np.float32(stack[frames[bit], row, x])
     if len(inverses):
         return (value - np.float32(stack[inverses[bit], row, x])) * np.float32(0.5)
@@ -233,6 +250,6 @@ def bit_height(stack, frames, inverses, bit, row, x, threshold):
 
 @numba.njit(inline="always")
 def allocate_five(width):
-    """Five rows of float32; arrays of their own, so that the compiler knows that none overlap."""
+    """Allocate five rows of float32; separate arrays, so that the compiler knows that none overlap."""
     a, b, c = np.empty(width, np.float32), np.empty(width, np.float32), np.empty(width, np.float32)
     return a, b, c, np.empty(width, np.float32), np.empty(width, np.float32)

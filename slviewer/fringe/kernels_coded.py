@@ -1,4 +1,4 @@
-"""The Gray code beside a phase shift, compiled; `reference` is what it must agree with."""
+"""Decoding of Gray code with a phase shift, compiled; `reference` is the definition that it must agree with."""
 
 from typing import NamedTuple
 
@@ -27,8 +27,12 @@ WEAK, WEAKER, UNDECIDED = np.float32(limits.WEAK_BIT / 2), np.float32(limits.WEA
 
 
 class CodeRules(NamedTuple):
-    """The frames of a Gray code, most significant bit first, and of its inverses, or none; ``complementary``: that of
-    the complementary bit, or -1. Code 0 begins ``origin_turns`` periods from phase 0; ``mean``: see `threshold`."""
+    """Frames and origin of a Gray code that numbers the periods of a phase shift.
+
+    ``gray``, ``inverse``: frames of the bits, most significant first, and of their inverses, or none;
+    ``complementary``: that of the complementary bit, or -1. Code 0 begins ``origin_turns`` periods from phase 0;
+    ``mean``: see `threshold`.
+    """
 
     gray: np.ndarray
     inverse: np.ndarray
@@ -39,8 +43,11 @@ class CodeRules(NamedTuple):
 
 @numba.njit
 def read_bit(value, level, digit, over_least, under_most, at_one, at_nought, full):
-    """The next binary digit, the parity of all Gray bits so far, and what `code_row` keeps of the samples so far: the
-    least over the level and the most under it, and the last at a 1 and at a 0."""
+    """Read one Gray bit: return the next binary digit and the updated extremes of the samples so far.
+
+    The digit is the parity of all Gray bits so far. The extremes, see `code_row`, are the least sample above the level
+    and the largest below it, and the last samples at a 1 and at a 0.
+    """
     over = value > level
     one = np.uint8(digit ^ np.uint8(over))
     over_least = min(over_least, value if over else full)
@@ -50,8 +57,11 @@ def read_bit(value, level, digit, over_least, under_most, at_one, at_nought, ful
 
 @numba.njit(inline="always")
 def code_row(stack, frames, inverses, row, threshold, code, least, top, bottom, lower, upper):
-    """One row's binary code, and of its bits' heights above their threshold the least in size, the highest and the
-    lowest, and those of the bits that change at the ``lower`` and at the ``upper`` edge of the code.
+    """Read the binary code of one image row, and the heights of its bits above their threshold.
+
+    Fills ``code`` (w,) and, in grey levels (w,): ``least``, the smallest height in size; ``top``, the highest, at least
+    0; ``bottom``, the lowest, at most 0; and the heights of the bits that change at the ``lower`` and at the ``upper``
+    edge of the code.
 
     From k - 1 to k the Gray bit changes at whose place k has its last binary 1; from k to k + 1 that of its last 0. A
     code without such a bit has no such edge: infinite.
@@ -138,8 +148,10 @@ def code_row(stack, frames, inverses, row, threshold, code, least, top, bottom, 
 
 @numba.njit(inline="always")
 def coded_row(stack, row, scale, rules, psi, B, A, peak, code, buffers, phase, reason):
-    """One row's absolute phase and reason from what ``shift_row`` left; ``code`` (w,) int32 and what `allocate_five`
-    gives are buffers."""
+    """Compute the absolute phase and the reason of one image row from the output of `shift_row`.
+
+    ``code`` (w,) int32 and ``buffers`` from `allocate_five` are buffers.
+    """
     width = stack.shape[2]
     least, top, bottom, lower, upper = buffers
     code_row(stack, rules.gray, rules.inverse, row, A, code, least, top, bottom, lower, upper)
@@ -186,7 +198,7 @@ def coded_row(stack, row, scale, rules, psi, B, A, peak, code, buffers, phase, r
 
 @kernel()
 def coded_rows(stack, shifts, scale, rules, first, phase, wrapped, modulation, background, reason):
-    """`decode_coded` of some rows from ``first`` on: the five maps hold only those."""
+    """Decode rows from ``first`` on, see `decode_coded`; the five maps contain only these rows."""
     width, steps = stack.shape[2], select_period(shifts, 0)
     peak, code, buffers = np.empty(width, stack.dtype), np.empty(width, np.int32), allocate_five(width)
     for i in range(len(phase)):

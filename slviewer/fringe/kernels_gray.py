@@ -1,4 +1,4 @@
-"""Gray code alone, compiled; `reference` is what this must agree with."""
+"""Decoding of Gray code alone, compiled; `reference` is the definition that it must agree with."""
 
 from typing import NamedTuple
 
@@ -12,9 +12,12 @@ TWO_PI = 2 * np.pi
 
 
 class GrayRules(NamedTuple):
-    """The frames of a Gray code, most significant bit first, of its inverses, or none, and ``white`` and ``black``, or
-    -1. Cells of ``cell`` px begin at ``origin``; the projector ends at ``high`` px. ``sigma_part``: noise of a bit over
-    that of a grey level."""
+    """Frames and cells of a Gray code without phase steps.
+
+    ``gray``, ``inverse``: frames of the bits, most significant first, and of their inverses, or none; ``white`` and
+    ``black``: frames, or -1. Cells of ``cell`` px begin at ``origin`` px; the projector ends at ``high`` px.
+    ``sigma_part``: noise of a bit over that of a grey level.
+    """
 
     gray: np.ndarray
     inverse: np.ndarray
@@ -31,12 +34,12 @@ def decode_gray(stack: np.ndarray, scale: Scale, rules: GrayRules, maps: tuple[n
 
     Fills the five (h, w) ``maps``, see `kernels_coded.decode_coded`; the wrapped phase is NaN.
     """
-    run_rows(_gray_rows, stack.shape[1], read_only(stack), scale, rules, *maps)
+    run_rows(_decode_gray_rows, stack.shape[1], read_only(stack), scale, rules, *maps)
 
 
 @kernel()
-def _gray_rows(start, stop, stack, scale, rules, phase, wrapped, modulation, background, reason):
-    """`decode_gray` of a range of rows."""
+def _decode_gray_rows(start, stop, stack, scale, rules, phase, wrapped, modulation, background, reason):
+    """Decode a range of rows, see `decode_gray`."""
     gray, inverse, white, black = rules.gray, rules.inverse, rules.white, rules.black
     width = stack.shape[2]
     per_px = TWO_PI / rules.cell

@@ -1,4 +1,4 @@
-"""Multi-frequency decoding, compiled; `reference` is what this must agree with."""
+"""Multi-frequency decoding, compiled; `reference` is the definition that it must agree with."""
 
 from typing import NamedTuple
 
@@ -24,13 +24,14 @@ PER_RAD = 1 / (2 * np.pi)
 
 
 class Ladder(NamedTuple):
-    """How several periods become one absolute phase; ``weights`` (levels, m) of the m wrapped phases and ``periods``
-    (levels,) px describe the levels, longest first. ``misfit`` and ``cell_misfit``: see `limits.LEVEL_MISFIT` and
-    `levels.cell_misfit`.
+    """Levels by which several periods are unwrapped to one absolute phase.
 
-    The first level is cut at ``low`` px, or, where there are Gray ``bits``, lies in the cells that they number: frames
-    (b,), most significant bit first, and of their ``inverses``, -1 for none. Cells of ``cell`` px begin at ``origin``;
-    ``mean``: see `threshold`.
+    ``weights`` (levels, m) of the m wrapped phases and ``periods`` (levels,) px describe the levels, longest first.
+    ``misfit`` and ``cell_misfit``: see `limits.LEVEL_MISFIT` and `levels.cell_misfit`.
+
+    The first level begins at ``low`` px, or, where there are Gray ``bits``, is unwrapped by the cells that they number:
+    frames (b,), most significant bit first, and of their ``inverses``, -1 for none. Cells of ``cell`` px begin at
+    ``origin``; ``mean``: see `threshold`.
     """
 
     weights: np.ndarray
@@ -47,8 +48,11 @@ class Ladder(NamedTuple):
 
 @numba.njit
 def cell_row(stack, row, B, A, ladder, heights, cell, worst):
-    """One row's coordinates px of the cells that the bits name, or of the border that a pixel lies at; ``worst`` is
-    infinite where a bit that is not the border's is undecided, else 0."""
+    """Compute the coordinates px of the cells of one row that the bits number, or of the border that a pixel is at.
+
+    Fills ``cell`` (w,) and ``worst`` (w,): infinite where a bit that does not change at the border is undecided, else
+    0.
+    """
     bits, inverses = ladder.bits, ladder.inverses
     last = len(bits) - 1
     mean, half, nothing = np.float32(ladder.mean), np.float32(0.5), np.float32(0)
@@ -87,14 +91,14 @@ def cell_row(stack, row, B, A, ladder, heights, cell, worst):
 
 @numba.njit(inline="always")
 def levels_row(psi, ladder, weakest, A, clipped, scale, cell, coordinate, order, own, worst, phase, reason):
-    """One row's absolute phase and reason from its (m, w) wrapped phases.
+    """Compute the absolute phase and the reason of one row from its (m, w) wrapped phases.
 
     ``coordinate`` ... ``worst`` (w,) are buffers.
 
     ``cell``: the coordinates px (w,) near which the first level's are, with ``worst`` infinite where they are not
-    known; empty where the first level is cut at ``low`` instead. ``weakest``: the smallest square of a modulation.
-    float32 knows a coordinate to some 1e-4 px, enough to tell whole periods apart; the phase itself is never a
-    coordinate. Loops run along the row, which the compiler turns into vector instructions.
+    known; empty where the first level begins at ``low`` instead. ``weakest``: the smallest square of a modulation.
+    float32 represents a coordinate to some 1e-4 px, enough to separate whole periods; the phase itself is never
+    computed from a coordinate. Loops run along the row, which the compiler turns into vector instructions.
     """
     count, width = psi.shape
     low, misfit = np.float32(ladder.low), np.float32(ladder.misfit)
@@ -147,7 +151,7 @@ def levels_row(psi, ladder, weakest, A, clipped, scale, cell, coordinate, order,
 
 @numba.njit(inline="always")
 def allocate_levels(width):
-    """Buffers for a row: whether clipped, and eight of float32."""
+    """Allocate the buffers of a row: whether clipped, and eight of float32."""
     a, b, c, d, e = allocate_five(width)
     f, g, h = np.empty(width, np.float32), np.empty(width, np.float32), np.empty(width, np.float32)
     return np.empty(width, np.bool_), a, b, c, d, e, f, g, h
@@ -155,11 +159,11 @@ def allocate_levels(width):
 
 @numba.njit(inline="always")
 def phases_row(stack, shifts, scale, row, psi, out, B, A, peak, buffers):
-    """One row's wrapped phases ``psi`` (m, w), and that ``out`` of the finest period with its modulation B and
-    background A; ``clipped`` and ``weakest`` of the
-    ``buffers`` are of all periods.
+    """Compute the wrapped phases of all periods of one row, and modulation and background of the finest.
 
-    The other periods' modulations are compared as squares, which spares their roots.
+    Fills ``psi`` (m, w), ``out`` (the finest wrapped phase), modulation ``B`` and background ``A`` (w,); ``clipped``
+    and ``weakest`` of the ``buffers`` are of all periods. The other periods' modulations are compared as squares, which
+    avoids their roots.
     """
     clipped, weakest, _, _, _, _, cosine, sine, total = buffers
     width, white = stack.shape[2], np.float32(scale.white)
@@ -187,7 +191,7 @@ def phases_row(stack, shifts, scale, row, psi, out, B, A, peak, buffers):
 
 @kernel()
 def levels_rows(stack, shifts, ladder, scale, first, phase, wrapped, modulation, background, reason):
-    """`decode_levels` of some rows from ``first`` on: the five maps hold only those."""
+    """Decode rows from ``first`` on, see `decode_levels`; the five maps contain only these rows."""
     count, width, bits = len(shifts.steps), stack.shape[2], len(ladder.bits)
     psi, peak, buffers = np.empty((count, width), np.float32), np.empty(width, stack.dtype), allocate_levels(width)
     clipped, weakest, coordinate, order, own, worst, _, _, _ = buffers

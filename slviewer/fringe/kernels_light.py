@@ -1,4 +1,4 @@
-"""Frames brought to equal light, compiled."""
+"""Scaling of frames to equal light, compiled."""
 
 import numba
 import numpy as np

@@ -1,8 +1,8 @@
 """Spikes of one period and pixels without support, compiled: the rule of a pixel, and kernels that apply it to a map.
 
-The rule is also compiled for CUDA devices (`geometry.cuda_device.device_function`); `reference_spikes` is what it must
-agree with. All changes are listed before the first is made, because a pixel's neighbours vote with the phase that they
-had. Nearly every pixel agrees with its four neighbours, and is passed over at the speed of memory.
+The rule is also compiled for CUDA devices (`geometry.cuda_device.device_function`); `reference_spikes` is the
+definition that it must agree with. All changes are listed before the first is made, because a pixel's neighbours vote
+with their original phase. Nearly every pixel agrees with its four neighbours, and is skipped at the speed of memory.
 """
 
 import math
@@ -29,10 +29,10 @@ RUN = 32
 
 
 class SpikeRules(NamedTuple):
-    """What of a layout the neighbourhood's decision about a pixel needs; thresholds are those of `limits`.
+    """Parameters of a layout that the decision about a pixel from its neighbourhood needs; thresholds are in `limits`.
 
     ``cell_rad``: the phase by which neighbours differ that count as a cell apart; ``is_plain``: the order comes from a
-    plain Gray code, whose edges lie at ``origin_rad``; ``low_rad`` and ``high_rad``: phases of the projector's borders,
+    plain Gray code, whose edges are at ``origin_rad``; ``low_rad`` and ``high_rad``: phases of the projector's borders,
     a tolerance outside, infinite for a relative phase, which repeats after ``repeat`` cells.
     """
 
@@ -45,7 +45,7 @@ class SpikeRules(NamedTuple):
 
 
 def spike_rules(layout: Layout) -> SpikeRules:
-    """The rules for the phases of a layout."""
+    """Return the rules for the phases of a layout."""
     period = 2 * np.pi
     # Gray code alone has no period: neighbouring cells agree
     cell = period if layout.shifts else period * max(limits.GRAY_CELL_PX / layout.gray_cell_px, limits.GRAY_CELLS)
@@ -60,13 +60,13 @@ def spike_rules(layout: Layout) -> SpikeRules:
 
 @numba.njit
 def do_agree(own, other, per_cell):
-    """Whether two phases differ by half a cell at most; False for NaN."""
+    """Return whether two phases differ by half a cell at most; False for NaN."""
     return abs((other - own) * per_cell) <= HALF
 
 
 @numba.njit
 def is_suspect(phase, row, x, per_cell):
-    """Whether one of a pixel's four neighbours is missing, or does not agree with it."""
+    """Return whether one of a pixel's four neighbours is missing, or does not agree with it."""
     if row == 0 or row == phase.shape[0] - 1 or x == 0 or x == phase.shape[1] - 1:
         return True
     own = phase[row, x]
@@ -76,7 +76,7 @@ def is_suspect(phase, row, x, per_cell):
 
 @numba.njit(inline="always")
 def count_votes(phase, row, x, rules):
-    """(valid, agreeing, a cell above, a cell below): numbers of the neighbours in the window."""
+    """Count the neighbours in a pixel's window that are valid, that agree, and that are a cell above or below it."""
     height, width = phase.shape
     per_cell, own = np.float32(1 / rules.cell_rad), phase[row, x]
     valid, agreeing, above, below = -1, -1, 0, 0  # the pixel itself is valid, and agrees
@@ -94,7 +94,10 @@ def count_votes(phase, row, x, rules):
 
 @numba.njit
 def period_change(phase, row, x, rules):
-    """UP or DOWN where a clear majority of the neighbours is one period above or below a pixel at a code edge."""
+    """Return UP or DOWN for a pixel at a code edge that a clear majority of the neighbours moves by one period.
+
+    Otherwise UNCHANGED.
+    """
     part = (phase[row, x] - np.float32(rules.origin_rad)) * PER_TURN
     part = part - np.float32(math.floor(part))
     if part >= EDGE and part < FAR_EDGE:
@@ -109,7 +112,7 @@ def period_change(phase, row, x, rules):
 
 @numba.njit
 def masking_reason(phase, row, x, suspect, rules):
-    """The reason to mask a pixel, or UNCHANGED; neighbours vote only where one is ``suspect``."""
+    """Return the reason to mask a pixel, or UNCHANGED; neighbours vote only where one is ``suspect``."""
     if suspect:
         valid, agreeing, _, _ = count_votes(phase, row, x, rules)
         if valid < LONELY_NEIGHBOURS or agreeing < LONELY * valid:
@@ -119,14 +122,14 @@ def masking_reason(phase, row, x, suspect, rules):
 
 
 def allocate_lists(shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """``columns``, ``words`` and ``counts`` for `list_changes` of a map (h, w)."""
+    """Allocate ``columns``, ``words`` and ``counts`` for `list_changes` of a map (h, w)."""
     return np.empty(shape, np.uint16), np.empty(shape, np.uint8), np.empty(shape[0], np.int64)
 
 
 def list_changes(
     phase: np.ndarray, rules: SpikeRules, masking: bool, columns: np.ndarray, words: np.ndarray, counts: np.ndarray
 ) -> None:
-    """List what changes in ``phase`` (h, w): of row v, ``counts[v]`` pixels, at ``columns[v]``.
+    """List the pixels to change in ``phase`` (h, w): in row v ``counts[v]`` pixels, at ``columns[v]``.
 
     ``masking``: pixels to mask, ``words[v]`` being their reasons; else those to be moved by a period, UP or DOWN.
     """
@@ -135,7 +138,7 @@ def list_changes(
 
 @kernel()
 def _list_rows(start, stop, phase, rules, masking, columns, words, counts):
-    """`list_changes` of a range of rows."""
+    """List the changes of a range of rows, see `list_changes`."""
     width = phase.shape[1]
     suspect, examined = np.empty(width, np.bool_), np.empty(width, np.bool_)
     for row in range(start, stop):
@@ -144,7 +147,10 @@ def _list_rows(start, stop, phase, rules, masking, columns, words, counts):
 
 @numba.njit
 def _list_row(phase, row, rules, masking, columns, words, suspect, examined):
-    """List the changes of one row: returns their number; columns and packed words are written, the rest are buffers."""
+    """List the changes of one row and return their number.
+
+    Fills ``columns`` and ``words``; ``suspect`` and ``examined`` (w,) are buffers.
+    """
     width = phase.shape[1]
     low, high = np.float32(rules.low_rad), np.float32(rules.high_rad)
     _mark_suspects(phase, row, np.float32(1 / rules.cell_rad), suspect)
@@ -173,7 +179,7 @@ def _list_row(phase, row, rules, masking, columns, words, suspect, examined):
 
 @numba.njit(inline="always")
 def _mark_suspects(phase, row, per_cell, suspect):
-    """`is_suspect` of a row, without branches, for vector instructions."""
+    """Mark the suspect pixels of a row, see `is_suspect`, without branches, for vector instructions."""
     height, width = phase.shape
     if row == 0 or row == height - 1:
         for x in range(width):
@@ -189,7 +195,7 @@ def _mark_suspects(phase, row, per_cell, suspect):
 
 @kernel()
 def move_phases(columns, words, counts, phase):
-    """Move the listed phases by a period."""
+    """Move the listed phases by a period, in place."""
     for row in range(len(counts)):
         for i in range(counts[row]):
             phase[row, columns[row, i]] += TURN if words[row, i] == UP else -TURN
@@ -197,7 +203,7 @@ def move_phases(columns, words, counts, phase):
 
 @kernel()
 def mask_phases(columns, words, counts, phase, reason):
-    """Mask the listed phases, for the reasons listed."""
+    """Mask the listed phases, for the listed reasons, in place."""
     for row in range(len(counts)):
         for i in range(counts[row]):
             phase[row, columns[row, i]], reason[row, columns[row, i]] = INVALID, words[row, i]

@@ -1,4 +1,4 @@
-"""Where in a stack of frames the parts of one axis' pattern lie."""
+"""Frame indices of one axis' pattern in a stack, and the conventions of its sequence."""
 
 from dataclasses import dataclass
 
@@ -18,7 +18,7 @@ SAME_WIDTH = 1e-6
 
 @dataclass(frozen=True)
 class Shift:
-    """The frames of one period, by step."""
+    """Period (px) of a phase shift, and the indices of its frames by step."""
 
     period_px: float
     indices: tuple[int, ...]
@@ -30,7 +30,7 @@ class Layout:
 
     ``extent`` is that of the projector in px, infinite where its size is not known. ``shifts`` longest period first;
     ``gray`` most significant bit first; ``inverse`` like ``gray``, or empty. ``relative``: whether a phase that is not
-    absolute will do.
+    absolute is acceptable.
     """
 
     axis: Axis
@@ -49,7 +49,7 @@ class Layout:
 
     @property
     def period_px(self) -> float:
-        """The finest period; the width of a cell for Gray code alone."""
+        """Finest period, px; the width of a cell for Gray code alone."""
         return self.shifts[-1].period_px if self.shifts else self.gray_cell_px
 
     @property
@@ -71,23 +71,23 @@ class Layout:
 
     @property
     def steps(self) -> int:
-        """Phase steps of the finest period; 0 for Gray code alone."""
+        """Number of phase steps of the finest period; 0 for Gray code alone."""
         return len(self.shifts[-1].indices) if self.shifts else 0
 
     @property
     def origin_rad(self) -> float:
-        """The finest period's phase at which Gray code 0 begins."""
+        """Phase of the finest period, rad, at which Gray code 0 begins."""
         return 2 * np.pi * self.gray_origin_px / self.period_px
 
 
 def axis_layout(sequence: PatternSequence, axis: Axis) -> Layout:
-    """The layout of one axis. Raises InputError where its frames cannot give an absolute phase."""
+    """Return the layout of one axis. Raises InputError where its frames cannot give an absolute phase."""
     if axis not in sequence.axes:
         there = f"use axis {sequence.axes[0]}" if sequence.axes else "phase steps or Gray bits are needed"
         raise InputError(f"no frame carries a pattern along axis {axis}: {there}")
     shifts = tuple(Shift(*shift) for shift in sequence.phase_shifts(axis))
     gray, inverse, complementary, white, black = (
-        _frames_by_bit(sequence, axis, kind) for kind in ("gray", "inverse", "complementary", "white", "black")
+        _list_frames_by_bit(sequence, axis, kind) for kind in ("gray", "inverse", "complementary", "white", "black")
     )
     layout = Layout(
         axis,
@@ -125,12 +125,15 @@ def check_stack(sequence: PatternSequence, stack: np.ndarray) -> None:
 
 
 def white_level(stack: np.ndarray, indices: list[int]) -> float:
-    """The grey level at which the camera clips, as `clip_level` takes it from these frames."""
+    """Return the grey level at which the camera clips, derived from these frames as in `clip_level`."""
     return clip_level(stack.dtype, 0 if stack.dtype == np.uint8 else max(int(stack[i].max()) for i in indices))
 
 
 def clip_level(dtype: np.dtype, largest: int) -> float:
-    """255 for uint8; for uint16 full scale at the depth that the largest value asks for."""
+    """Return the grey level at which a camera clips: 255 for uint8, for uint16 the full scale of its bit depth.
+
+    ``largest``: largest grey level in the frames, from which the bit depth is derived.
+    """
     if dtype == np.uint8:
         return 255.0
     if largest in LEFT_ALIGNED_WHITE:
@@ -139,7 +142,7 @@ def clip_level(dtype: np.dtype, largest: int) -> float:
 
 
 def to_eight_bits(image: np.ndarray, largest: int | None = None) -> NDArray[np.uint8]:
-    """An image (h, w) or (h, w, 3), uint8 or uint16, as uint8: the upper eight of the camera's bits.
+    """Convert an image (h, w) or (h, w, 3), uint8 or uint16, to uint8: the upper eight of the camera's bits.
 
     ``largest``: the largest grey level of the frame that it is a part of; None: its own.
     """
@@ -149,8 +152,8 @@ def to_eight_bits(image: np.ndarray, largest: int | None = None) -> NDArray[np.u
     return (image >> (int(white).bit_length() - 8)).astype(np.uint8)
 
 
-def _frames_by_bit(sequence: PatternSequence, axis: Axis, kind: Kind) -> tuple[int, ...]:
-    """Indices of the frames of one kind, the most significant bit first."""
+def _list_frames_by_bit(sequence: PatternSequence, axis: Axis, kind: Kind) -> tuple[int, ...]:
+    """Return the indices of the frames of one kind, the most significant bit first."""
     return tuple(sorted(sequence.find(kind, axis), key=lambda i: sequence.frames[i].bit))
 
 

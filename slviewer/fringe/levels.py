@@ -1,5 +1,4 @@
-"""Multi-frequency unwrapping: from a phase that covers the projector, or a Gray cell, down to the finest, level by
-level."""
+"""Multi-frequency unwrapping, level by level: from a phase that covers the projector, or a Gray cell, to the finest."""
 
 from dataclasses import dataclass
 from itertools import combinations, pairwise
@@ -16,7 +15,7 @@ LONGEST = 3
 
 @dataclass(frozen=True)
 class Level:
-    """A phase made of measured ones: sum of weights * wrapped phases, with the period that this combination has."""
+    """Combination of measured phases: the sum of weights * wrapped phases, and the period (px) that it has."""
 
     period_px: float
     weights: tuple[int, ...]
@@ -27,10 +26,11 @@ WHOLE = 1e-3
 
 
 def layout_levels(layout: Layout) -> tuple[Level, ...]:
-    """The levels of a layout whose Gray code, if any, does not number the periods of its one phase shift.
+    """Return the levels by which the periods of a layout are unwrapped, the longest first.
 
-    Raises InputError where the periods do not cover what they must: a Gray cell, the projector, or, where a relative
-    phase will do, a range of whole periods.
+    For a layout whose Gray code, if any, does not number the periods of its one phase shift. Raises InputError where
+    the periods do not cover what they must: a Gray cell, the projector, or, where a relative phase is acceptable, a
+    range of whole periods.
     """
     periods, where = tuple(shift.period_px for shift in layout.shifts), f"axis {layout.axis}: "
     if layout.gray:
@@ -54,7 +54,7 @@ def layout_levels(layout: Layout) -> tuple[Level, ...]:
 
 
 def unambiguous_px(layout: Layout) -> float:
-    """The range of projector px that a layout tells apart, where it is less than the projector; else infinite."""
+    """Return the unambiguous range of a layout in projector px, where it is less than the projector; else infinite."""
     if layout.gray or not layout.shifts:
         return np.inf
     reach = layout_levels(layout)[0].period_px
@@ -62,23 +62,25 @@ def unambiguous_px(layout: Layout) -> float:
 
 
 def lowest_coordinate(period_px: float, extent: float) -> float:
-    """Where the longest period is cut: what it has beyond the projector is split evenly between both ends."""
+    """Return the coordinate px at which the longest period begins; its excess is split evenly between both ends."""
     return -0.5 - (period_px - extent) / 2
 
 
 def code_cell_px(layout: Layout) -> float:
-    """Width of the cells that all `code_bits` number."""
+    """Return the width, px, of the cells that all `code_bits` number."""
     return layout.gray_cell_px / (1 if layout.complementary is None else 2)
 
 
 def cell_misfit(layout: Layout) -> float:
-    """Largest distance, in periods of the first level, between a coordinate and the middle of the cell that holds it:
-    half way between half a cell, where the cell ends, and half a period, where the next order begins."""
+    """Return the largest distance, in periods of the first level, of a coordinate from the middle of its Gray cell.
+
+    Half way between half a cell, where the cell ends, and half a period, where the next order begins.
+    """
     return 0.25 * (1 + code_cell_px(layout) / layout_levels(layout)[0].period_px)
 
 
 def plan_levels(periods_px: tuple[float, ...], extent: float) -> tuple[Level, ...]:
-    """Levels from one whose period covers ``extent`` px down to the finest period; weights are per period, as given.
+    """Plan the levels from one whose period covers ``extent`` px down to the finest; weights are per period, as given.
 
     ``periods_px`` are longest first. Where none covers the extent, beats of two, then of three of the longest take
     their place (heterodyne). Raises InputError where these do not cover it either.
@@ -106,11 +108,11 @@ def plan_levels(periods_px: tuple[float, ...], extent: float) -> tuple[Level, ..
 def unwrap_levels(
     levels: tuple[Level, ...], wrapped: list[np.ndarray], low: float, near: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
-    """Coordinate px and order of the finest period, float64 of the shape of its phase, level by level.
+    """Unwrap level by level: coordinate px and order of the finest period, float64 of the shape of its phase.
 
     ``wrapped``: phases rad of all periods, longest first. The first level is the one near the coordinates ``near`` px,
-    or without them from ``low`` px on. Third: for each level that is compared, the periods between the coordinate known
-    before and the level's own phase, whole where both agree.
+    or without them from ``low`` px on. Third, for each level that is compared: the periods between the coordinate of
+    the previous level and the level's own phase, whole where both agree.
     """
     coordinate, order, turns = near, np.zeros(np.shape(wrapped[0])), list[np.ndarray]()
     for level in levels:
@@ -127,8 +129,10 @@ def unwrap_levels(
 
 
 def find_common_range(periods_px: tuple[float, ...]) -> float:
-    """px after which all phases of the periods repeat, and up to which they tell coordinates apart: the longest period
-    or a beat of two. Raises InputError where no such range holds whole numbers of all periods."""
+    """Return the range px after which all phases of the periods repeat, and within which coordinates are unambiguous.
+
+    It is the longest period or a beat of two. Raises InputError where no such range holds whole numbers of all periods.
+    """
     count = min(LONGEST, len(periods_px))
     beats = [_combine_periods(periods_px, {j: 1, i: -1}).period_px for i, j in combinations(range(count), 2)]
     for reach in sorted({periods_px[0], *beats}, reverse=True):
@@ -143,7 +147,7 @@ def find_common_range(periods_px: tuple[float, ...]) -> float:
 
 
 def required_modulation(levels: tuple[Level, ...], steps: int) -> float:
-    """The modulation, in standard deviations of a grey level, with which each level surely finds the order of the next.
+    """Return the modulation, in standard deviations of a grey level, that each level needs for the order of the next.
 
     ``steps``: phase steps of the period with the fewest.
     """
@@ -158,12 +162,12 @@ def required_modulation(levels: tuple[Level, ...], steps: int) -> float:
 
 
 def _join_periods(periods_px: tuple[float, ...]) -> str:
-    """Periods as text, separated by commas."""
+    """Return periods as text, separated by commas."""
     return ", ".join(f"{p:g}" for p in periods_px)
 
 
 def _combine_periods(periods_px: tuple[float, ...], weights: dict[int, int]) -> Level:
-    """The beat of several periods whose phases are added with integer weights."""
+    """Return the beat of several periods whose phases are added with integer weights."""
     frequency = sum(w / periods_px[i] for i, w in weights.items())
     sign = 1 if frequency >= 0 else -1
     period = 1 / abs(frequency) if frequency else np.inf

@@ -1,8 +1,8 @@
-"""The gains and offsets of a capture's frames that explain a sample of its pixels.
+"""Fit of the gains and offsets of a capture's frames to a sample of its pixels.
 
 Per pixel, the phase-shifted frames have one background in common and one phasor for each period; Gray, white and black
-frames show one of two levels, dark or bright; and the background lies between these at one share for the whole image.
-What remains when these unknowns are eliminated depends on the light of the frames alone, and is solved for it by
+frames show one of two levels, dark or bright; and the background is between these at one share for the whole image. The
+residual after these unknowns are eliminated depends on the light of the frames alone, and is solved for it by
 Gauss-Newton steps (variable projection), with priors where the frames do not determine it.
 """
 
@@ -25,23 +25,23 @@ room's light as a share of the mean grey level."""
 WIDTH: dict[Term, int] = {"gain": 1, "wave": 2, "uniform": 1, "albedo": 3}
 """Values of each term per frame."""
 SHARE_PRIOR = 0.5, 0.2
-"""Where the mean of the fringes lies between dark and bright: 0.5, or 0.3 to 0.65 under the usual gammas."""
+"""Position of the mean of the fringes between dark and bright, and its uncertainty: 0.3 to 0.65 for usual gammas."""
 GROUP_PRIOR = 0.003
 """By how much all coded frames together may differ from all phase-shifted ones, relative: that difference can hardly be
-determined from the share above, and decoding has no need to tell them apart."""
+determined from the share above, and decoding does not need to separate them."""
 LINK_ERROR = 0.02
-"""Share of the contrast by which blur moves a pixel's background off its place between dark and bright."""
+"""Share of the contrast by which blur shifts a pixel's background between dark and bright."""
 COMMON = 1e4
-"""Precision, relative to the priors', with which the mean over all frames is kept: it is the scene's own."""
+"""Precision, relative to the priors', with which the mean over all frames is constrained: it is the scene's own."""
 HARMONIC_PRIOR = 0.1
 HARMONIC_STEPS = 4
-"""Up to so many steps, n, the fringe's harmonic n is large enough to be seen in the background."""
+"""Largest number n of steps for which the fringe's harmonic n is significant in the background."""
 ONE_SIDED = 0.5
-"""Length of the mean unit phasor above which a shift's pixels do not see all phases."""
+"""Length of the mean unit phasor above which a shift's pixels do not cover all phases."""
 MIN_FRAMES = 3
 """Frames that must be known on either side of a change of the room's light: one or two may just be of other gain."""
 MIN_ENTRIES = 0.03
-"""Share of the sampled pixels that must lie inside a coded frame's bright stripes."""
+"""Share of the sampled pixels that must be inside a coded frame's bright stripes."""
 MAX_STEPS = 6
 CONVERGED = 5e-4
 OUTLIER = 4.0
@@ -50,12 +50,12 @@ OUTLIER = 4.0
 
 @dataclass(frozen=True, eq=False)
 class Light:
-    """What multiplies and what is added to each of n frames.
+    """Factor and offset of the light in each of n frames.
 
     ``gain`` (n,); ``wave`` (n, 2): relative cosine and sine of ``cycles`` per image height along the rows; ``uniform``
     (n,) grey levels; ``albedo`` (n, 3) times the scene's albedo (in grey levels): constant, along columns, along rows
-    (both -0.5 ... 0.5). The room's light, `uniform` and `albedo`, changes before the frames ``changes`` only: of room
-    light that varies freely, a part in step with the fringes could not be told from them.
+    (both -0.5 ... 0.5). The room light, `uniform` and `albedo`, changes before the frames ``changes`` only: if it
+    varied freely, a part in step with the fringes could not be separated from them.
     """
 
     gain: np.ndarray
@@ -67,15 +67,16 @@ class Light:
 
     @classmethod
     def constant(cls, count: int, cycles: float = 0.0) -> "Light":
-        """Frames of equal light."""
+        """Return equal light for ``count`` frames."""
         return cls(np.ones(count), np.zeros((count, 2)), cycles, np.zeros(count), np.zeros((count, 3)))
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """A light, the mean squared residual that it leaves, and where the fringes' mean lies between dark and bright.
+    """Fitted light of the frames of a sample.
 
-    ``weight`` (p,): what each sampled pixel counts; ``informed``: the frames that the sample says something about.
+    ``variance``: mean squared residual; ``share``: position of the fringes' mean between dark (0) and bright (1);
+    ``weight`` (p,): weight of each sampled pixel; ``informed``: the frames whose light the sample determines.
     """
 
     light: Light
@@ -93,7 +94,11 @@ def fit_light(
     weight: np.ndarray | None = None,
     most_steps: int = MAX_STEPS,
 ) -> Fit:
-    """The light of the given terms that leaves the least; ``start`` also says the wave's cycles."""
+    """Fit the light of the given terms to a sample by Gauss-Newton steps.
+
+    ``start``: initial light, which also defines the wave's cycles; ``weight`` (p,): fixed weight of each pixel, robust
+    weights if None; ``most_steps``: number of steps at most.
+    """
     light, share = start, SHARE_PRIOR[0]
     fixed = weight
     weight = np.ones(sample.frames.shape[1], np.float32) if weight is None else weight
@@ -103,7 +108,7 @@ def fit_light(
         remainder = model.eliminate(light, share, weight)
         variance = max(remainder.variance, 1e-3)
         change, share_change = remainder.solve(light, terms, variance, share)
-        light, share = _moved(light, change, model), float(np.clip(share + share_change, 0.05, 0.95))
+        light, share = _update_light(light, change, model), float(np.clip(share + share_change, 0.05, 0.95))
         if fixed is None:
             weight = remainder.robust_weight()
         if all(np.abs(values).max() < CONVERGED * remainder.scale(term) for term, values in change.items()):
@@ -113,7 +118,10 @@ def fit_light(
 
 
 def locate_room_change(sample: LightSample, light: Light, with_gain: bool, weight: np.ndarray) -> tuple[int, ...]:
-    """The frame from which on a change of the room's light, beside gains or alone, explains the most; empty if none."""
+    """Return the frame before which a change of the room light explains most of the residual; empty if there is none.
+
+    ``with_gain``: together with gains, else alone; ``weight`` (p,) of the pixels.
+    """
     model = light_model(sample)
     remainder = model.eliminate(light, SHARE_PRIOR[0], weight)
     normal, moment = remainder.normal_equations(
@@ -145,12 +153,12 @@ def locate_room_change(sample: LightSample, light: Light, with_gain: bool, weigh
 
 
 def equalize_sample(sample: LightSample, light: Light, used: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
-    """(u, p) samples under equal light, and the gains that they were divided by."""
+    """Return the samples (u, p) of the frames ``used`` under equal light, and the gains (u, p) that divided them."""
     frames = sample.frames[used]
     gain = np.broadcast_to(light.gain[used, None].astype(np.float32), frames.shape)
     wave = light.wave[used].astype(np.float32)
     if wave.any():
-        cosine, sine = _row_wave(sample, light.cycles)
+        cosine, sine = _compute_row_wave(sample, light.cycles)
         gain = gain * (1 + wave[:, :1] * cosine + wave[:, 1:] * sine)
     if light.uniform.any() or light.albedo.any():
         shapes = np.stack([np.ones_like(sample.column), sample.column - 0.5, sample.row - 0.5])
@@ -159,14 +167,14 @@ def equalize_sample(sample: LightSample, light: Light, used: Sequence[int]) -> t
     return frames / gain, gain
 
 
-def _row_wave(sample: LightSample, cycles: float) -> tuple[np.ndarray, np.ndarray]:
-    """Cosine and sine of a wave along the image rows, at the sampled pixels."""
+def _compute_row_wave(sample: LightSample, cycles: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return cosine and sine (p,) of a wave along the image rows at the sampled pixels; ``cycles`` per image height."""
     angle = np.float32(2 * np.pi * cycles) * sample.row
     return np.cos(angle), np.sin(angle)
 
 
-def _moved(light: Light, change: dict[Term, np.ndarray], model: "LightModel") -> Light:
-    """The light after a step; frames that the sample says nothing about keep the mean of the others."""
+def _update_light(light: Light, change: dict[Term, np.ndarray], model: "LightModel") -> Light:
+    """Return the light after a step; frames that the sample does not determine change like the mean of the others."""
     gain, wave, uniform, albedo = light.gain.copy(), light.wave.copy(), light.uniform.copy(), light.albedo.copy()
     used, known = model.used, np.isin(model.used, model.informed)
     for term in ("gain", "wave"):
@@ -186,14 +194,21 @@ def _moved(light: Light, change: dict[Term, np.ndarray], model: "LightModel") ->
 
 @lru_cache(maxsize=2)
 def light_model(sample: LightSample) -> "LightModel":
-    """The model of a sample: one of the coarse sample, and one of the other, serve all fits of a capture."""
+    """Return the model of a sample, cached for the last two samples: the coarse and the full one of a capture."""
     return LightModel(sample)
 
 
 class LightModel:
-    """Which frames share what."""
+    """Structure of the fit: which frames share a background, a phasor, or a level of dark and bright.
+
+    ``phased``, ``used``: indices of the phase-shifted frames, and of all frames in the fit; ``keep``: matrix that
+    projects phase steps onto their residual; ``phase_freedom``: its degrees of freedom; ``classes``, ``counts``: masks
+    of the dark and of the bright stripes (c, p) and their frames per pixel (p,); ``informed``: frames whose light can
+    be determined.
+    """
 
     def __init__(self, sample: LightSample) -> None:
+        """Build the model of a sample."""
         self.sample = sample
         self.phased = [i for shift in sample.shifts for i in shift]
         self.used = [*self.phased, *sample.coded]
@@ -205,7 +220,7 @@ class LightModel:
             place = slice(first, first + steps)
             phasor = fit_cosine(sample.frames[list(shift)])[1]
             turning = abs(complex(np.mean(phasor / np.maximum(np.abs(phasor), 1e-6)))) < ONE_SIDED
-            # Of a fringe seen in part of its phases, harmonics cannot be separated from light: its frames are free.
+            # If only part of the phases is in view, harmonics cannot be separated from light: its frames are free.
             part = np.zeros((n, 2 if turning else steps))
             part[place] = cosine_columns(np.arange(steps), steps, 1)[:, 1:] if turning else np.eye(steps)
             parts.append(part)
@@ -232,7 +247,10 @@ class LightModel:
         )
 
     def eliminate(self, light: Light, share: float, weight: np.ndarray) -> "Remainder":
-        """Remove what pattern and surface explain of the frames under a light; what remains is of light and noise."""
+        """Eliminate pattern and surface from the frames under a light; the residual contains only light and noise.
+
+        ``share``: see `Fit`; ``weight`` (p,) of the pixels.
+        """
         sample, n = self.sample, len(self.phased)
         frames, gain = equalize_sample(sample, light, self.used)
         shown, left = np.zeros_like(frames), np.zeros_like(frames)
@@ -262,7 +280,12 @@ class LightModel:
 
 @dataclass(eq=False)
 class Remainder:
-    """What the frames of some light leave when each pixel's own unknowns are eliminated."""
+    """Residual of the frames under a light after each pixel's own unknowns are eliminated.
+
+    ``gain``, ``shown``, ``left`` (u, p): gains, fitted levels and residuals; ``levels``, ``counts``: level and number
+    of the dark and of the bright frames of each pixel (p,); ``harmonics``: frames of a shift and its aliased harmonic
+    in them.
+    """
 
     model: LightModel
     gain: np.ndarray
@@ -275,6 +298,7 @@ class Remainder:
     weight: np.ndarray
 
     def __post_init__(self) -> None:
+        """Compute contrast and link: the background's deviation from its share between dark and bright."""
         dark, bright = self.levels
         self.contrast = bright - dark
         linked = (self.counts[0] > 0) & (self.counts[1] > 0) & bool(self.model.determined)
@@ -283,7 +307,7 @@ class Remainder:
         self.link = np.where(linked, background - (1 - self.share) * dark - self.share * bright, 0).astype(np.float32)
 
     def scale(self, term: Term) -> float:
-        """The unit of a term: 1, or what makes the albedo or 1 the mean grey level."""
+        """Return the unit of a term: 1, or what converts ``uniform`` or ``albedo`` to the mean grey level."""
         if term == "uniform":
             return self._mean_level
         albedo = max(float(np.mean(self.model.sample.amplitudes[-1])), 1e-3)
@@ -297,22 +321,25 @@ class Remainder:
 
     @property
     def freedom(self) -> float:
-        """Weighted degrees of freedom of the remainder."""
+        """Weighted degrees of freedom of the residual."""
         entries = sum(np.maximum(count - 1, 0) for count in self.counts)
         return float(np.sum(self.weight * (self.model.phase_freedom + entries)))
 
     @property
     def variance(self) -> float:
-        """Mean squared residual of a sample, of the link among them."""
+        """Weighted mean squared residual of the sample, including that of the link."""
         own, freedom = float(np.sum(self.weight * (self.left**2).sum(axis=0))), self.freedom
         variance = max(own / max(freedom, 1.0), 1 / 12)
-        weight = self._link_weight(variance, self.share)
+        weight = self._compute_link_weight(variance, self.share)
         return (own + float(np.sum(weight * self.link**2))) / max(
             freedom + float(np.sum(self.weight * self.linked)), 1.0
         )
 
     def row_excess(self) -> tuple[np.ndarray, np.ndarray]:
-        """Relative light (u, rows) that each image row leaves in each frame, and the rows' places, 0 ... 1."""
+        """Return the relative residual light (u, rows) of each image row in each frame, and the rows' positions.
+
+        Positions are 0 at the top of the image and 1 at the bottom.
+        """
         rows, place = np.unique(self.model.sample.row, return_inverse=True)
         inside = np.ones_like(self.shown)
         inside[len(self.model.phased) :] = self.model.sample.interior
@@ -321,7 +348,7 @@ class Remainder:
         return sums[0] / np.maximum(sums[1], 1e-6), rows
 
     def robust_weight(self) -> np.ndarray:
-        """(p,) float32: weight of each pixel, small for those that deviate from most."""
+        """Return the weight (p,) float32 of each pixel, small for outliers."""
         entries = sum(np.maximum(count - 1, 0) for count in self.counts)
         freedom = self.model.phase_freedom + entries
         ratio = (self.left**2).sum(axis=0) / np.maximum(freedom, 1)
@@ -331,9 +358,9 @@ class Remainder:
     def solve(
         self, light: Light, terms: Sequence[Term], variance: float, share: float
     ) -> tuple[dict[Term, np.ndarray], float]:
-        """Solve the linearised fit: the step (u, k) of each term of the light, and that of the share."""
+        """Solve the linearised fit: the change (u, k) of each term of the light, and the change of the share."""
         normal, moment = self.normal_equations(light, terms, variance, share)
-        into = self._by_changes(terms, light.changes, len(normal))
+        into = self._build_change_matrix(terms, light.changes, len(normal))
         solution = into @ np.linalg.solve(into.T @ normal @ into, into.T @ moment)
         change: dict[Term, np.ndarray] = {}
         at, u = 0, len(self.model.used)
@@ -346,10 +373,14 @@ class Remainder:
     def normal_equations(
         self, light: Light, terms: Sequence[Term], variance: float, share: float
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Normal matrix and moment, with priors: for each term each of its shapes (u,), harmonics, and the share."""
+        """Return normal matrix and moment of the fit, with priors.
+
+        The unknowns are the values (u,) of each shape of each term, then the harmonics, and the share. ``variance``: of
+        the residual, which the equations are divided by.
+        """
         model, sample = self.model, self.model.sample
         n, u = len(model.phased), len(model.used)
-        cosine, sine = _row_wave(sample, light.cycles)
+        cosine, sine = _compute_row_wave(sample, light.cycles)
         albedo = sample.albedo(light.changes)
         one = np.ones_like(cosine)
         shapes: dict[Term, list[np.ndarray]] = {
@@ -375,7 +406,7 @@ class Remainder:
             reach[n:] -= part * members / np.maximum(count, 1)
         waves = [wave.sum(axis=0) / len(model.determined) for _, wave in self.harmonics]
         moved = np.concatenate([(R * reach).reshape(total, p), np.array(waves).reshape(-1, p), self.contrast[None]])
-        link_weight = self._link_weight(variance, share)
+        link_weight = self._compute_link_weight(variance, share)
         normal = ((moved * link_weight) @ moved.T).astype(float)
         moment = (moved @ (link_weight * self.link)).astype(float)
         # What remains of the frames themselves: phase steps project by ``keep``, coded frames lose their class' mean.
@@ -404,8 +435,11 @@ class Remainder:
         self._add_priors(normal, moment, light, terms, share, total)
         return normal, moment
 
-    def _by_changes(self, terms: Sequence[Term], changes: tuple[int, ...], total: int) -> np.ndarray:
-        """(total, unknowns): from gains, waves, and the steps of the room's light to what each frame has."""
+    def _build_change_matrix(self, terms: Sequence[Term], changes: tuple[int, ...], total: int) -> np.ndarray:
+        """Return the matrix (total, unknowns) that expands the steps of the room light to the values of each frame.
+
+        Gains and waves have one unknown per frame.
+        """
         used = np.array(self.model.used)
         after = np.stack([used >= k for k in changes], axis=1).astype(float) if changes else np.zeros((len(used), 0))
         blocks = []
@@ -413,8 +447,8 @@ class Remainder:
             blocks += [np.eye(len(used)) if term in ("gain", "wave") else after] * WIDTH[term]
         return np.asarray(block_diag(*blocks, np.eye(total - len(blocks) * len(used))))
 
-    def _link_weight(self, variance: float, share: float) -> np.ndarray:
-        """(p,) float32: weight of the equations that relate coded frames to phase steps."""
+    def _compute_link_weight(self, variance: float, share: float) -> np.ndarray:
+        """Return the weight (p,) float32 of the equations that relate coded frames to phase steps."""
         dark, bright = (np.maximum(count, 1) for count in self.counts)
         parts = 1 / max(len(self.model.determined), 1) + (1 - share) ** 2 / dark + share**2 / bright
         error = (LINK_ERROR * self.contrast) ** 2

@@ -1,4 +1,4 @@
-"""The sampled pixels from which the light of each frame is estimated."""
+"""Sample of the pixels from which the light of each frame is estimated."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -23,9 +23,9 @@ SHOWN = 0.03
 """Share of the pixels that must be bright in a Gray frame of an axis that was shown."""
 MIN_PIXELS = 60
 OFFSETS = np.linspace(-8, 8, 161)
-"""Modulations by which a bit without an inverse may lie above or below the fringes' mean: by the light of the room."""
+"""Offsets, in modulations, of a bit without an inverse from the fringes' mean, due to room light."""
 SHARPER = (1.0, 1.25, 1.5, 2.0)
-"""Modulations by which it then lies above or below that: blur takes more from fringes than from stripes."""
+"""Distances, in modulations, of the bit's levels from that offset: blur reduces fringes more than stripes."""
 LEAST_OFFSET = 0.2
 """Of the modulation; blur and shading move a frame by less."""
 
@@ -34,11 +34,11 @@ LEAST_OFFSET = 0.2
 class LightSample:
     """Samples (n, p) float32 grey levels of all n frames at p pixels.
 
-    ``row`` and ``column`` (p,) reach from 0 to 1 across the image. ``shifts``: the frames of each phase shift, by
-    step. ``coded``: the Gray, white and black frames (c,); ``interior`` and ``bright`` (c, p) bool: where such a frame
-    shows the inside of a stripe, and whether that is bright. ``partner`` (c,): for bits and inverses, the place in
-    ``coded`` of the other, else -1. ``amplitudes`` (s, p): half of what the projector adds, in grey levels, as each
-    phase shift shows it, or the Gray code. ``roughness``: grey levels by which neighbours differ.
+    ``row`` and ``column`` (p,): position in the image, 0 to 1. ``shifts``: the frames of each phase shift, by step.
+    ``coded``: the Gray, white and black frames (c,); ``interior`` and ``bright`` (c, p) bool: where such a frame shows
+    the interior of a stripe, and whether that is bright. ``partner`` (c,): for bits and inverses, the index in
+    ``coded`` of the other, else -1. ``amplitudes`` (s, p): half of the projector's light, in grey levels, from each
+    phase shift, or from the Gray code. ``roughness``: grey levels by which neighbours differ.
     """
 
     frames: np.ndarray
@@ -53,18 +53,18 @@ class LightSample:
     roughness: float
 
     def albedo(self, changes: Sequence[int]) -> np.ndarray:
-        """(p,) grey levels, in proportion to what the scene reflects, of frames between which no light ``changes``."""
+        """Return grey levels (p,) in proportion to the albedo, from frames between which no light ``changes``."""
         if not self.shifts:
-            return _half_range(self.frames, self.coded, self.partner, changes)
+            return _compute_half_range(self.frames, self.coded, self.partner, changes)
         return self.amplitudes[steady_shift(self.shifts, changes)]
 
 
 def sample_light(
     sequence: PatternSequence, stack: np.ndarray, gain: np.ndarray | None = None, *, coarse: bool = False
 ) -> LightSample | None:
-    """The sample of a capture (n, h, w); None where too few pixels see the pattern unclipped.
+    """Sample the frames of a capture (n, h, w); None where too few pixels see the pattern unclipped.
 
-    ``gain`` (n,) of the frames, as far as it is known, keeps bits and inverses of unequal light apart. ``coarse``: an
+    ``gain`` (n,): known gains of the frames, by which bits and inverses of unequal light are separated; ``coarse``: an
     eighth of the pixels.
     """
     height, width = stack.shape[1:]
@@ -96,7 +96,7 @@ def sample_light(
             return None
         shown = np.flatnonzero(
             pixel_counts > 0.5 * pixel_counts.max()
-        )  # an axis that was not shown, or is out of view, is no witness
+        )  # excludes an axis that was not shown, or is out of view
         amplitudes, shifts = amplitudes[shown], tuple(shifts[s] for s in shown)
         phased = [i for shift in shifts for i in shift]
         valid = (amplitudes.min(axis=0) > limit) & (frames[phased].max(axis=0) < white)
@@ -106,9 +106,9 @@ def sample_light(
     if np.count_nonzero(valid) < MIN_PIXELS:  # too few for statistics
         return None
     row, column, frames = row[valid], column[valid], frames[:, valid]
-    partner = _find_partner_frames(sequence, coded)
+    partner = _match_partner_frames(sequence, coded)
     amplitudes = amplitudes[:, valid]
-    interior, bright = _find_stripe_interiors(
+    interior, bright = _detect_stripe_interiors(
         sequence, stack, frames, coded, partner, row, column, gain, DECIDED * amplitudes[-1], phased
     )
     if coded:
@@ -128,7 +128,7 @@ def sample_light(
 
 
 def estimate_albedo(sequence: PatternSequence, frames: np.ndarray, changes: Sequence[int] = ()) -> np.ndarray:
-    """float32 of the shape of one of the ``frames`` (n, ...): half of what the projector adds, in grey levels.
+    """Return half of the projector's light in grey levels, float32 of the shape of one of the ``frames`` (n, ...).
 
     The modulation of a phase shift between whose frames no light ``changes``, or half the range of the coded frames
     between two changes.
@@ -138,14 +138,16 @@ def estimate_albedo(sequence: PatternSequence, frames: np.ndarray, changes: Sequ
         chosen = np.stack([frames[i] for i in shifts[steady_shift(shifts, changes)]]).astype(np.float32)
         return np.abs(fit_cosine(chosen.reshape(len(chosen), -1))[1]).reshape(frames.shape[1:])
     coded = tuple(i for i, f in enumerate(sequence.frames) if f.kind != "texture")
-    return _half_range(frames, coded, _find_partner_frames(sequence, coded), changes)
+    return _compute_half_range(frames, coded, _match_partner_frames(sequence, coded), changes)
 
 
-def _half_range(
+def _compute_half_range(
     frames: np.ndarray, coded: Sequence[int], partner: Sequence[int], changes: Sequence[int]
 ) -> np.ndarray:  # fmt: skip
-    """Half the difference, float32, of bright and dark among ``coded`` frames: the largest between a bit and its
-    inverse, which see the same light of the room; without inverses, the range of the most frames between two changes.
+    """Return half the difference, float32 grey levels, of bright and dark among the ``coded`` frames.
+
+    This is the largest difference between a bit and its inverse, which see the same room light; without inverses, the
+    range of the longest run of frames between two ``changes``.
     """
     pairs = [(i, coded[k]) for i, k in zip(coded, partner, strict=True) if k > -1]
     if pairs:
@@ -157,19 +159,25 @@ def _half_range(
 
 
 def steady_shift(shifts: Sequence[Sequence[int]], changes: Sequence[int]) -> int:
-    """The place of the last shift between whose frames no light ``changes``; -1, the last, where there is none."""
+    """Return the index of the last shift between whose frames no light ``changes``.
+
+    -1, the last, where there is none.
+    """
     return next(
         (s for s in reversed(range(len(shifts))) if not any(min(shifts[s]) < k <= max(shifts[s]) for k in changes)), -1
     )
 
 
 def _list_shifts(sequence: PatternSequence) -> tuple[tuple[int, ...], ...]:
-    """Frames of every phase-shifted period, of all axes."""
+    """Return the frames of every phase-shifted period, of all axes."""
     return tuple(steps for axis in sequence.axes for _, steps in sequence.phase_shifts(axis))
 
 
-def _find_partner_frames(sequence: PatternSequence, coded: tuple[int, ...]) -> tuple[int, ...]:
-    """For each coded frame the place of its inverse among them; -1 without one."""
+def _match_partner_frames(sequence: PatternSequence, coded: tuple[int, ...]) -> tuple[int, ...]:
+    """Return for each coded frame the index in ``coded`` of its inverse, or of the bit that it inverts.
+
+    -1 without one.
+    """
     place = {(sequence.frames[i].kind, sequence.frames[i].axis, sequence.frames[i].bit): k for k, i in enumerate(coded)}
     other = {"gray": "inverse", "inverse": "gray"}
     return tuple(
@@ -177,7 +185,7 @@ def _find_partner_frames(sequence: PatternSequence, coded: tuple[int, ...]) -> t
     )  # fmt: skip
 
 
-def _find_stripe_interiors(
+def _detect_stripe_interiors(
     sequence: PatternSequence,
     stack: np.ndarray,
     frames: np.ndarray,
@@ -189,7 +197,11 @@ def _find_stripe_interiors(
     least: np.ndarray,
     phased: list[int],
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(c, p) bool each: where a coded frame shows a stripe's inside, and whether it is bright."""
+    """Return where each coded frame shows the interior of a stripe, and whether it is bright: (c, p) bool each.
+
+    ``gain`` (n,): known gains, 1 if None; ``least`` (p,): grey levels from the threshold that an interior needs;
+    ``phased``: the phase-shifted frames, whose mean is the threshold.
+    """
     gain = np.ones(len(stack)) if gain is None else gain
     ends = [i for i in coded if sequence.frames[i].kind in ("white", "black")]
     reference = phased or (ends if len(ends) > 1 else list(coded))
@@ -233,9 +245,11 @@ def _find_stripe_interiors(
 
 
 def _estimate_room_offsets(levels: list[np.ndarray], modulation: np.ndarray) -> list[float]:
-    """Grey levels that the pixels (p,) of each frame have in common beside plus or minus the modulation (p,), where it
-    is so much that dark stripes could be taken for bright ones; else 0. ``levels``: above the mean of the fringes.
-    Frames that are dark, or bright, throughout have none: of these it cannot be told.
+    """Estimate the room light of each frame, in grey levels, where it could make dark stripes appear bright; else 0.
+
+    This is the offset that the pixels have in common besides plus or minus the ``modulation`` (p,). ``levels``: grey
+    levels (p,) of each frame above the mean of the fringes. Frames that are dark, or bright, throughout do not
+    determine it.
     """
     some = np.s_[:: max(1, len(modulation) // 1000)]
     modulation = modulation[some]

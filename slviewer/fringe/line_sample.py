@@ -1,4 +1,4 @@
-"""Pixels of some rows and columns of all frames, with which a description is compared."""
+"""Sample of some rows and columns of all frames, against which a description is checked."""
 
 from dataclasses import dataclass, replace
 
@@ -10,13 +10,13 @@ from slviewer.fringe.residual_sample import estimate_roughness
 from slviewer.fringe.sequence import Axis, PatternSequence
 
 PIXELS = 40_000
-"""So many on rows, and on columns: twenty edges also of the most significant bit, whichever way the stripes run."""
+"""Number of pixels on rows, and on columns: twenty edges even of the most significant bit, in either direction."""
 GRID = 100
 """Pixels along the shorter side of the grid that shows where the patterns are."""
 BLOCK = 4
 """Neighbouring columns that are read together: they share the memory's cache lines."""
 NOISE_RANGE = 2 * limits.DARK_SIGMAS
-"""A pixel whose grey level varies by so many standard deviations from frame to frame sees a pattern: of fifty frames of
+"""Range of a pixel's grey levels, in standard deviations, from which it shows a pattern: in fifty frames of
 noise alone the range stays below seven in 99.99 % of the pixels."""
 
 
@@ -24,10 +24,10 @@ noise alone the range stays below seven in 99.99 % of the pixels."""
 class LineSample:
     """Pixels of some rows and columns of n frames.
 
-    ``frames`` (n, p) float32 grey levels; ``line`` (p,) counts the lines, of which those below ``rows`` are image rows;
-    ``place`` (p,) px along a line. ``lines`` (n, rows, width) the same pixels of the rows, and ``grid`` (n, gh, gw) a
-    thinned image, as captured. ``white``: level at which the camera clips; ``noise``: grey levels by which neighbours
-    differ.
+    ``frames`` (n, p) float32 grey levels; ``line`` (p,): index of the line, image rows below ``rows``, columns from
+    there; ``place`` (p,): px along a line. ``lines`` (n, rows, width): the same pixels of the rows, and ``grid`` (n,
+    gh, gw): a thinned image, as captured. ``white``: level at which the camera clips; ``noise``: grey levels by which
+    neighbours differ.
     """
 
     frames: np.ndarray
@@ -40,23 +40,23 @@ class LineSample:
     noise: float
 
     def swing(self, indices: list[int]) -> np.ndarray:
-        """(p,) float32 grey levels from the darkest to the brightest of these frames."""
+        """Return the range of grey levels, (p,) float32, from the darkest to the brightest of these frames."""
         chosen = self.frames[indices]
         return chosen.max(axis=0) - chosen.min(axis=0)
 
     @property
     def least_swing(self) -> float:
-        """Grey levels by which a pixel must vary to carry a pattern."""
+        """Grey levels by which a pixel must vary to show a pattern."""
         return max(2 * limits.DARK_LEVELS * self.white / 255, NOISE_RANGE * self.noise)
 
 
 def sample_lines(sequence: PatternSequence, stack: np.ndarray, pixels: int = PIXELS) -> LineSample:
-    """Rows and columns of an (n, h, w) stack, spread evenly over what the patterns illuminate."""
+    """Sample rows and columns of an (n, h, w) stack, spread evenly over the area that the patterns illuminate."""
     return sample_frames(stack, coded_frames(sequence), pixels)
 
 
 def sample_frames(stack: np.ndarray, coded: list[int], pixels: int = PIXELS) -> LineSample:
-    """The same of a stack whose frames ``coded`` carry a pattern."""
+    """Sample rows and columns of an (n, h, w) stack whose frames ``coded`` show a pattern, see `sample_lines`."""
     height, width = stack.shape[1:]
     step = max(1, min(height, width) // GRID)
     grid = np.ascontiguousarray(stack[:, step // 2 :: step, step // 2 :: step])
@@ -64,8 +64,8 @@ def sample_frames(stack: np.ndarray, coded: list[int], pixels: int = PIXELS) -> 
     swing = (coded_grid.max(axis=0) - coded_grid.min(axis=0)).astype(np.float32)
     white = white_level(grid, list(range(len(grid))))
     pattern = np.maximum(swing - 2 * limits.DARK_LEVELS * white / 255, 0)
-    rows = _lines_through(pattern.sum(axis=1), step, height, round(pixels / width))
-    columns = _lines_through(pattern.sum(axis=0), step, width, round(pixels / height / BLOCK))
+    rows = _select_lines(pattern.sum(axis=1), step, height, round(pixels / width))
+    columns = _select_lines(pattern.sum(axis=0), step, width, round(pixels / height / BLOCK))
     columns = np.unique(np.minimum(columns[:, None] + np.arange(BLOCK), width - 1))
     lines = np.ascontiguousarray(stack[:, rows])
     across = stack[:, :, columns].transpose(0, 2, 1)
@@ -79,7 +79,7 @@ def sample_frames(stack: np.ndarray, coded: list[int], pixels: int = PIXELS) -> 
 
 
 def grid_sample(sample: LineSample) -> LineSample:
-    """The thinned image as a sample of its own."""
+    """Return the pixels of the thinned image as a sample of their own."""
     count, height, width = sample.grid.shape
     place = np.tile(np.arange(width), height)
     line = np.repeat(np.arange(height), width)
@@ -88,8 +88,11 @@ def grid_sample(sample: LineSample) -> LineSample:
     )
 
 
-def _lines_through(weight: np.ndarray, step: int, size: int, count: int) -> np.ndarray:
-    """So many of ``size`` rows or columns, as many through each part of the image as it weighs."""
+def _select_lines(weight: np.ndarray, step: int, size: int, count: int) -> np.ndarray:
+    """Select about ``count`` of ``size`` rows or columns, with a density in proportion to ``weight``.
+
+    ``weight``: of every ``step``-th row or column.
+    """
     count = max(1, min(count, size))
     total = np.cumsum(weight + 1e-3 * max(float(weight.max()), 1e-6))
     places = np.interp((np.arange(count) + 0.5) / count * total[-1], total, np.arange(len(total)))
@@ -97,6 +100,6 @@ def _lines_through(weight: np.ndarray, step: int, size: int, count: int) -> np.n
 
 
 def coded_frames(sequence: PatternSequence, axis: Axis | None = None) -> list[int]:
-    """Indices of the frames that carry a pattern, along one axis or any."""
+    """Return the indices of the frames that show a pattern, along one axis or any."""
     axes = sequence.axes if axis is None else (axis,)
     return sorted({i for a in axes for i in sequence.select(a) if sequence.frames[i].axis == a})

@@ -1,4 +1,4 @@
-"""The camera's noise, measured from the frames of one capture."""
+"""Measurement of the camera's noise from the frames of one capture."""
 
 import numpy as np
 from scipy.optimize import nnls
@@ -9,45 +9,47 @@ from slviewer.fringe.residual_sample import cosine_columns, fit_common_harmonics
 ROWS = 20
 """Image rows that are sampled."""
 BLOCK = 8
-"""Neighbouring pixels whose variances are averaged before medians are taken: single variances are too skewed."""
+"""Neighbouring pixels whose variances are averaged before the median: single variances are too skewed."""
 BINS = 16
 OWN_HARMONICS = 4
-"""Highest harmonic that is fitted pixel by pixel; what gamma makes beyond it is below the noise."""
+"""Highest harmonic that is fitted pixel by pixel; those that gamma adds beyond it are below the noise."""
 
 
 def measure_noise(layout: Layout, stack: np.ndarray, white: float) -> tuple[float, float]:
-    """(a, b): the variance of one frame's grey level is a + b * level, in squared grey levels; both non-negative.
+    """Measure (a, b): the variance of one frame's grey level is a + b * level, in squared grey levels.
 
-    From what an n-step phase shift cannot explain: per pixel, cosines up to a harmonic that n allows are removed; then,
-    from all pixels together, what the remaining harmonics have in common with the fringe, so that gamma is not taken
-    for noise. Three steps, and Gray code alone, leave no such remainder: then from the constancy of Gray + inverse, or
+    Both non-negative.
+
+    From the residual of an n-step phase shift: per pixel, cosines up to a harmonic that n allows are removed; then,
+    from all pixels together, what the remaining harmonics have in common with the fringe, so that gamma does not count
+    as noise. Three steps, and Gray code alone, have no such residual: then from the constancy of Gray + inverse, or
     from differences along image rows or columns, whichever are smaller: those along the stripes. Sampled from a few
     rows, or columns, of the image.
     """
     if layout.steps >= 4:
-        levels, variances, freedom = _noise_from_phase_steps(sample(stack, layout.shifts[-1].indices), white)
+        levels, variances, freedom = _measure_phase_step_noise(sample(stack, layout.shifts[-1].indices), white)
     elif len(layout.inverse) >= 2:
-        levels, variances, freedom = _noise_from_inverses(
+        levels, variances, freedom = _measure_inverse_noise(
             sample(stack, layout.gray), sample(stack, layout.inverse), white
         )
     else:
         frames = layout.shifts[-1].indices if layout.shifts else (layout.white, layout.black)
         indices = tuple(i for i in frames if i is not None)
-        along = [_noise_from_differences(sample(s, indices), white) for s in (stack, stack.transpose(0, 2, 1))]
+        along = [_measure_difference_noise(sample(s, indices), white) for s in (stack, stack.transpose(0, 2, 1))]
         fits = [_bin_variances(*differences) for differences in along if len(differences[0])]
         # Fringes and texture only ever add to the differences.
-        return _fit_line(*min(fits, key=_mean_variance)) if fits else (0.0, 0.0)
+        return _fit_line(*min(fits, key=_compute_mean_variance)) if fits else (0.0, 0.0)
     return _fit_line(*_bin_variances(levels, variances, freedom))
 
 
-def _mean_variance(bins: tuple[np.ndarray, np.ndarray, np.ndarray]) -> float:
-    """Mean variance of the bins, weighted by their counts."""
+def _compute_mean_variance(bins: tuple[np.ndarray, np.ndarray, np.ndarray]) -> float:
+    """Return the mean variance of the bins, weighted by their counts."""
     _, variances, counts = bins
     return float(variances @ counts / counts.sum())
 
 
 def sample(stack: np.ndarray, indices: tuple[int, ...]) -> np.ndarray:
-    """(n, rows, blocks, BLOCK) float32 of evenly spread rows; all pixels of a row that fill whole blocks."""
+    """Sample evenly spread rows of the frames: (n, rows, blocks, BLOCK) float32; pixels that fill whole blocks."""
     height, width = stack.shape[1:]
     rows = np.unique(np.linspace(0, height - 1, min(ROWS, height)).round().astype(int))
     block = BLOCK if width >= BLOCK else 1
@@ -60,8 +62,8 @@ def sample(stack: np.ndarray, indices: tuple[int, ...]) -> np.ndarray:
     )
 
 
-def _noise_from_phase_steps(samples: np.ndarray, white: float) -> tuple[np.ndarray, np.ndarray, float]:
-    """(levels, variances, degrees of freedom) of blocks, from what a cosine leaves of the phase steps."""
+def _measure_phase_step_noise(samples: np.ndarray, white: float) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return levels, variances and degrees of freedom of blocks, from the residual of cosines in the phase steps."""
     n = len(samples)
     samples = samples[:, _select_unclipped_blocks(samples, white)]  # (n, blocks, BLOCK)
     own = max(1, min(OWN_HARMONICS, (n - 1) // 2 - 2))
@@ -78,19 +80,22 @@ def _noise_from_phase_steps(samples: np.ndarray, white: float) -> tuple[np.ndarr
     return samples.mean(axis=(0, 2)), variance, freedom * samples.shape[-1]
 
 
-def _noise_from_inverses(gray: np.ndarray, inverse: np.ndarray, white: float) -> tuple[np.ndarray, np.ndarray, float]:
-    """(levels, variances, degrees of freedom) of blocks, from sums of bits and their inverses."""
+def _measure_inverse_noise(gray: np.ndarray, inverse: np.ndarray, white: float) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return levels, variances and degrees of freedom of blocks, from sums of bits and their inverses."""
     usable = _select_unclipped_blocks(np.concatenate([gray, inverse]), white)
     total = (gray + inverse)[:, usable]
-    # What light of other surfaces and of the room adds to a frame hardly differs between neighbours.
+    # Interreflected light and room light hardly differ between neighbours.
     rest = total - total.mean(axis=0)
     rest -= rest.mean(axis=-1, keepdims=True)
     freedom = (len(total) - 1) * max(total.shape[-1] - 1, 1)
     return total.mean(axis=(0, -1)) / 2, (rest**2).sum(axis=(0, -1)) / (2 * freedom), freedom
 
 
-def _noise_from_differences(samples: np.ndarray, white: float) -> tuple[np.ndarray, np.ndarray, float]:
-    """Variance from third differences along a line: fringes and shading are nearly quadratic over four pixels."""
+def _measure_difference_noise(samples: np.ndarray, white: float) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return levels, variances and degrees of freedom of blocks, from third differences along a line.
+
+    Fringes and shading are nearly quadratic over four pixels.
+    """
     if samples.shape[-1] < BLOCK:
         return np.zeros(0), np.zeros(0), 1.0
     usable = _select_unclipped_blocks(samples, white)
@@ -100,14 +105,14 @@ def _noise_from_differences(samples: np.ndarray, white: float) -> tuple[np.ndarr
 
 
 def _select_unclipped_blocks(samples: np.ndarray, white: float) -> np.ndarray:
-    """(rows, blocks): neither clipped at white nor at black, which would hide noise."""
+    """Return a mask (rows, blocks) of the blocks clipped neither at white nor at black, which would hide noise."""
     return (samples.max(axis=(0, -1)) < white) & (samples.min(axis=(0, -1)) > 0)
 
 
 def _bin_variances(
     levels: np.ndarray, variances: np.ndarray, freedom: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Mean level, robust variance and number of blocks in bins of equal count."""
+    """Return mean level, robust variance and number of blocks in bins of equal count."""
     order = np.argsort(levels)
     bins = [b for b in np.array_split(order, min(BINS, max(1, len(order) // 24))) if len(b)]
     to_mean = (1 - 2 / (9 * freedom)) ** 3  # the median of chi squared over its mean
@@ -119,7 +124,7 @@ def _bin_variances(
 
 
 def _fit_line(levels: np.ndarray, variances: np.ndarray, counts: np.ndarray) -> tuple[float, float]:
-    """Non-negative (a, b) of variance = a + b level, each bin weighted by its own precision."""
+    """Fit non-negative (a, b) of variance = a + b level, each bin weighted by its own precision."""
     if len(levels) < 2:
         return (float(variances[0]) if len(levels) else 0.0), 0.0
     weight = np.sqrt(counts) / np.maximum(variances, 0.1 * variances.mean() + 1e-12)

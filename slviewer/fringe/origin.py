@@ -1,4 +1,4 @@
-"""Where another tool's Gray code begins, read off its own frames."""
+"""Estimation of the origin of another tool's Gray code from its own frames."""
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from slviewer.fringe.line_sample import coded_frames, sample_lines
 from slviewer.fringe.sequence import Axis, PatternSequence
 
 MIN_EDGES = FEWEST_EDGES
-"""Code edges between neighbouring pixels that a judgement needs."""
+"""Smallest number of code edges between neighbouring pixels."""
 MIN_CONCENTRATION = 0.7
 """Length of the mean unit vector of the phases at code edges, weighed by modulation; 1 where all edges fall at one
 phase, 0 anywhere."""
@@ -20,20 +20,19 @@ MIN_RISING = 0.8
 LATEST_TURNS = 0.25
 """Where code 0 begins at the latest, in periods."""
 PIXELS = 60_000
-"""On rows, and on columns: so many place the origin to a few hundredths of a pixel."""
+"""Number of pixels on rows, and on columns: the origin is then accurate to a few hundredths of a pixel."""
 
 
 def estimate_gray_origin(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -> float:
-    """The projector coordinate, px, at which Gray code 0 begins.
+    """Estimate the projector coordinate, px, at which Gray code 0 begins.
 
-    Between two neighbouring camera pixels whose codes follow upon each other lies a code edge, and the wrapped phase
-    there is that of the origin (half a period more at every other edge of a complementary code). The mean over all
-    edges does not depend on the sequence's own ``gray_origin_px``. Whole periods, which no frame can tell, are chosen
-    so that code 0 holds the projector's first column, or begins at most a quarter of a period after it: no code is
-    negative.
+    Between two neighbouring camera pixels whose codes are consecutive there is a code edge, and the wrapped phase there
+    is that of the origin (half a period more at every other edge of a complementary code). The mean over all edges does
+    not depend on the sequence's own ``gray_origin_px``. Whole periods, which no frame determines, are chosen so that
+    code 0 contains the projector's first column, or begins at most a quarter of a period after it: no code is negative.
 
-    Raises InputError where the code falls as the phase rises (the frames want the other ``phase_sign``), and where the
-    edges fall at no common phase (wrong period, order of bits, or order of frames).
+    Raises InputError where the code falls as the phase rises (the frames have the other ``phase_sign``), and where the
+    edges have no common phase (wrong period, order of bits, or order of frames).
     """
     check_stack(sequence, stack)
     layout = axis_layout(sequence, axis)

@@ -1,4 +1,4 @@
-"""The images that the projector shows."""
+"""Rendering of the images that the projector shows."""
 
 import numpy as np
 
@@ -7,7 +7,7 @@ from slviewer.fringe.sequence import Axis, Frame, PatternSequence
 
 
 def render(sequence: PatternSequence, index: int) -> np.ndarray:
-    """(height, width) uint8: frame ``index`` as the projector shows it."""
+    """Render frame ``index`` as the projector shows it: (height, width) uint8."""
     width, height = sequence.projector
     axis, row = profile(sequence, index)
     shown = row[:, None] if axis == "y" else row[None, :]
@@ -15,10 +15,10 @@ def render(sequence: PatternSequence, index: int) -> np.ndarray:
 
 
 def profile(sequence: PatternSequence, index: int) -> tuple[Axis | None, np.ndarray]:
-    """The axis along which frame ``index`` varies, and its uint8 grey levels along it.
+    """Return the axis along which frame ``index`` varies, and its uint8 grey levels along it.
 
     A frame without an axis gives (None, one level per projector column). Cosines span 0 ... 255, bits are 0 or 255.
-    Where the sequence has a table of `levels`, the cosines are those that it makes of them.
+    Where the sequence has a table of `levels`, it is applied to the cosines.
     """
     if not 0 <= index < len(sequence.frames):
         raise InputError(f"frame {index} of {len(sequence.frames)} does not exist: count from 0")
@@ -31,11 +31,11 @@ def profile(sequence: PatternSequence, index: int) -> tuple[Axis | None, np.ndar
         angle = 2 * np.pi * turns + sequence.offset_rad(frame.axis)
         cosine = np.floor(127.5 + 127.5 * np.cos(angle) + 0.5).astype(np.uint8)
         return frame.axis, cosine if sequence.levels is None else np.array(sequence.levels, np.uint8)[cosine]
-    return frame.axis, np.where(_gray_bit_along_axis(sequence, frame.axis, frame), 255, 0).astype(np.uint8)
+    return frame.axis, np.where(_compute_gray_bit(sequence, frame.axis, frame), 255, 0).astype(np.uint8)
 
 
-def _gray_bit_along_axis(sequence: PatternSequence, axis: Axis, frame: Frame) -> np.ndarray:
-    """(extent,) bool: the Gray bit at the centre of each projector column or row."""
+def _compute_gray_bit(sequence: PatternSequence, axis: Axis, frame: Frame) -> np.ndarray:
+    """Return the Gray bit, (extent,) bool, at the centre of each projector column or row. Raises InputError."""
     bits = len(sequence.find("gray", axis))
     cell, origin = sequence.gray_cell(axis), sequence.origin_px(axis)
     half = frame.kind == "complementary"

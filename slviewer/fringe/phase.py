@@ -1,4 +1,4 @@
-"""What one capture says along one axis, and why a pixel says nothing."""
+"""Phase map of one capture along one axis, and the reasons for masked pixels."""
 
 from dataclasses import dataclass
 from enum import IntEnum
@@ -14,7 +14,7 @@ GRAY_SIGMA_CELLS = 12**-0.5
 
 
 class Reason(IntEnum):
-    """Why a pixel has no absolute phase."""
+    """Reason why a pixel has no absolute phase."""
 
     VALID = 0
     DARK = 1
@@ -55,6 +55,7 @@ class PhaseMap:
     sigma_scale: float = 1.0
 
     def __post_init__(self) -> None:
+        """Raise InputError unless all maps have the same shape (h, w)."""
         maps = (self.phase, self.wrapped, self.modulation, self.background, self.reason)
         if any(m.ndim != 2 or m.shape != self.phase.shape for m in maps):
             raise InputError(
@@ -83,8 +84,10 @@ class PhaseMap:
 
     @property
     def sigma_phase(self) -> np.ndarray:
-        """(h, w) float32 rad: standard deviation of the phase, sqrt(2 / n) sigma_I / B and `model_error_rad` in
-        quadrature, times `sigma_scale`; 2 pi / sqrt(12) for Gray code alone. NaN where the phase is.
+        """(h, w) float32 rad: standard deviation of the phase. NaN where the phase is.
+
+        sqrt(2 / n) sigma_I / B and `model_error_rad` in quadrature, times `sigma_scale`; 2 pi / sqrt(12) for Gray code
+        alone.
         """
         if self.steps == 0:
             sigma = np.full_like(self.phase, 2 * np.pi * GRAY_SIGMA_CELLS)
@@ -105,8 +108,10 @@ class PhaseMap:
 
     @cached_property
     def edge_error_px(self) -> np.ndarray:
-        """(h, w) float32 px: by how much the camera's blur displaces the coordinate where the surface's brightness
-        jumps (see `edge_blur`); 0 for Gray code alone, NaN where the phase is."""
+        """(h, w) float32 px: error of the coordinate due to the camera's blur where the surface's brightness jumps.
+
+        See `edge_blur`; 0 for Gray code alone, NaN where the phase is.
+        """
         from slviewer.fringe.edge_blur import edge_error  # loads numba, which reading a phase does not need
 
         if self.steps == 0:

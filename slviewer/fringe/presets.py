@@ -10,7 +10,10 @@ AXES: tuple[Axis, ...] = ("x", "y")
 
 
 def p18(projector: tuple[int, int]) -> PatternSequence:
-    """18 steps at a period of 18 px, seven Gray bits (more where the projector needs them), then white; x, then y."""
+    """Return 18 steps at a period of 18 px, seven Gray bits (more if the projector needs them), then white.
+
+    X, then y.
+    """
     frames: list[Frame] = []
     for axis, extent in zip(AXES, projector, strict=True):
         frames += phase_steps(axis, 18, 18.0) + gray_bits(axis, max(7, bits_for(extent / 18)))
@@ -19,7 +22,7 @@ def p18(projector: tuple[int, int]) -> PatternSequence:
 
 
 def gray(projector: tuple[int, int]) -> PatternSequence:
-    """Gray code alone, each bit followed by its inverse; x, then y, white, black (the procam-calibration layout)."""
+    """Return Gray code alone, each bit followed by its inverse; x, then y, white, black (procam-calibration layout)."""
     frames: list[Frame] = []
     for axis, extent in zip(AXES, projector, strict=True):
         bits = bits_for(extent)
@@ -29,7 +32,7 @@ def gray(projector: tuple[int, int]) -> PatternSequence:
 
 
 def complementary(projector: tuple[int, int], steps: int = 8, period_px: float = 16.0) -> PatternSequence:
-    """Phase steps, Gray bits of the fringe order and the complementary bit; x, then y, then white."""
+    """Return phase steps, Gray bits of the fringe order and the complementary bit; x, then y, then white."""
     frames: list[Frame] = []
     for axis, extent in zip(AXES, projector, strict=True):
         frames += phase_steps(axis, steps, period_px) + gray_bits(axis, bits_for(extent / period_px))
@@ -40,7 +43,7 @@ def complementary(projector: tuple[int, int], steps: int = 8, period_px: float =
 def multifrequency(
     projector: tuple[int, int], steps: int = 6, periods_px: Sequence[float] | None = None
 ) -> PatternSequence:
-    """Phase steps at several periods, longest first; x, then y, then white.
+    """Return phase steps at several periods, longest first; x, then y, then white.
 
     ``periods_px`` defaults to 16 px, and as many periods eight times as long each as it takes to cover the axis.
     """
@@ -55,11 +58,11 @@ def multifrequency(
 
 
 def short(projector: tuple[int, int], axis: Axis) -> PatternSequence:
-    """11 frames of one axis, for scanning live: three steps each of a period longer than the axis and of one between,
-    four of the finest, 16 px, then white.
+    """Return 11 frames of one axis, for live scanning: 3 + 3 + 4 phase steps of three periods, then white.
 
-    The steps from one period to the next are alike, so that neither is the weaker. Four steps of the finest show no
-    second harmonic of the projector's, and contradict each other where something moved.
+    Three steps each of a period longer than the axis and of an intermediate one, four of the finest, 16 px. The ratios
+    of the periods are equal, so that neither unwrapping step is the weaker. Four steps of the finest suppress the
+    second harmonic of the projector, and contradict each other where something moved.
     """
     finest, longest = 16.0, 1.1 * projector[AXES.index(axis)]
     between = (finest * longest) ** 0.5
@@ -80,22 +83,25 @@ PRESETS: dict[str, Callable[[tuple[int, int]], PatternSequence]] = {
 
 
 def phase_steps(axis: Axis, steps: int, period_px: float) -> list[Frame]:
-    """All steps of one period, in order."""
+    """Return all steps of one period, in order."""
     return [Frame("phase", axis, step=k, steps=steps, period_px=float(period_px)) for k in range(steps)]
 
 
 def gray_bits(axis: Axis, bits: int) -> list[Frame]:
-    """Gray bits, most significant first."""
+    """Return the frames of a Gray code, most significant bit first."""
     return [Frame("gray", axis, bit=b, bits=bits) for b in range(bits)]
 
 
 def bits_for(cells: float) -> int:
-    """Bits that number so many cells."""
+    """Return the number of bits that number ``cells`` cells."""
     return max(1, ceil(log2(max(1, ceil(cells)))))
 
 
 def covering_periods(extent: int, finest: float = 16.0, ratio: float = 8.0) -> list[float]:
-    """Periods from the finest up, the last a tenth longer than the axis so that its ends cannot be confused."""
+    """Return periods px from the finest up to one that covers the axis.
+
+    The last is a tenth longer than the axis so that its ends cannot be confused. ``ratio``: of successive periods.
+    """
     periods = [finest]
     while periods[-1] * ratio < extent:
         periods.append(periods[-1] * ratio)

@@ -1,4 +1,4 @@
-"""Decoding as it is meant, in NumPy: the definition that the kernels must reproduce."""
+"""Decoding in NumPy: the definition that the kernels must reproduce."""
 
 import numpy as np
 
@@ -26,7 +26,7 @@ TWO_PI = 2 * np.pi
 
 
 def decode_reference(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -> PhaseMap:
-    """What `decode.decode` returns, computed without kernels: same wrapped phase to 1e-5 rad, absolute to 1e-4 rad."""
+    """Decode one axis without kernels, like `decode.decode`: same wrapped phase to 1e-5 rad, absolute to 1e-4 rad."""
     check_stack(sequence, stack)
     layout = axis_layout(sequence, axis)
     full = white_level(stack, sequence.select(axis))
@@ -69,9 +69,10 @@ def complete_map(
     noise: tuple[float, float],
     factor: float,
 ) -> PhaseMap:
-    """The phase map of decoded ``maps`` (phase, wrapped phase, modulation, background, reason), each (h, w): corrected
-    for gamma, in grey levels of the capture, which equalising multiplied by ``factor``, and with the scatter of its
-    phase. ``white`` and ``noise`` are those of the ``stack`` that was decoded.
+    """Return the phase map of decoded ``maps`` (phase, wrapped phase, modulation, background, reason), each (h, w).
+
+    The phase is corrected for gamma, grey levels are divided by the ``factor`` of equalisation, and the scatter of the
+    phase is measured. ``white`` and ``noise`` are those of the ``stack`` that was decoded.
     """
     phase, wrapped, modulation, background, reason = maps
     harmonics = estimate_aliased_harmonics(layout, stack, white, noise)
@@ -98,8 +99,10 @@ def complete_map(
 def phase_shift(
     stack: np.ndarray, indices: tuple[int, ...], sign: int, offset_rad: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """(wrapped phase rad, modulation, background, largest sample) of one period, float32 (h, w) each; ``sign`` and
-    ``offset_rad`` are the sequence's."""
+    """Return wrapped phase (rad), modulation, background and largest sample of one period, float32 (h, w) each.
+
+    ``sign`` and ``offset_rad`` are the sequence's.
+    """
     n = len(indices)
     first = stack[indices[0]].astype(np.float32)
     cosine, sine, total = np.zeros_like(first), np.zeros_like(first), np.zeros_like(first)
@@ -107,7 +110,7 @@ def phase_shift(
     for k, i in enumerate(indices):
         frame = stack[i].astype(np.float32)
         np.maximum(peak, frame, out=peak)
-        frame -= first  # drops out of the sums, and keeps them exact in float32
+        frame -= first  # cancels in the sums, which are then exact in float32
         cosine += np.float32(np.cos(TWO_PI * k / n)) * frame
         sine += np.float32(np.sin(TWO_PI * k / n)) * frame
         total += frame
@@ -120,7 +123,7 @@ def phase_shift(
 
 
 def dark_sigmas(layout: Layout) -> float:
-    """The modulation, in standard deviations of a grey level, below which a pixel is DARK."""
+    """Return the modulation, in standard deviations of a grey level, below which a pixel is DARK."""
     if layout.numbers_periods or not layout.shifts:
         return limits.DARK_SIGMAS
     steps = min(len(shift.indices) for shift in layout.shifts)
@@ -128,13 +131,16 @@ def dark_sigmas(layout: Layout) -> float:
 
 
 def dark_limit(background: np.ndarray, noise: tuple[float, float], white: float, sigmas: float) -> np.ndarray:
-    """(h, w) float32: the modulation below which a pixel is DARK."""
+    """Return the modulation (h, w) float32, grey levels, below which a pixel is DARK."""
     sigma = np.sqrt(np.float32(noise[0]) + np.float32(noise[1]) * background)
     return np.maximum(np.float32(limits.DARK_LEVELS * white / 255), np.float32(sigmas) * sigma)
 
 
 def bit_heights(layout: Layout, stack: np.ndarray, index: int, threshold: np.ndarray) -> np.ndarray:
-    """(h, w) float32 grey levels by which a bit lies above its threshold: half of gray - inverse where there is one."""
+    """Return the grey levels (h, w) float32 by which a bit is above its threshold.
+
+    Half of gray - inverse where there is an inverse.
+    """
     frame = stack[index].astype(np.float32)
     if index in layout.gray and layout.inverse:
         inverse = stack[layout.inverse[layout.gray.index(index)]].astype(np.float32)
@@ -145,7 +151,7 @@ def bit_heights(layout: Layout, stack: np.ndarray, index: int, threshold: np.nda
 def _decode_period_order(
     layout: Layout, stack: np.ndarray, wrapped: np.ndarray, modulation: np.ndarray, background: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What to add to the wrapped phase, in periods, and where it cannot be known."""
+    """Return the periods to add to the wrapped phase, and where this order is inconsistent, (h, w) each."""
     code, bit, heights = _read_code(layout, stack, layout.gray, background)
     least = np.min(np.abs(heights), axis=0)
     turns = wrapped * np.float32(1 / TWO_PI) - np.float32(layout.gray_origin_px / layout.period_px)
@@ -156,11 +162,11 @@ def _decode_period_order(
     if layout.complementary is not None:
         last = bit_heights(layout, stack, layout.complementary, background)
         half = 2 * code + (bit ^ (last > 0))
-        # Near an order's edge the half-period cell before it counts as the one after it, and the phase says which.
+        # Near an order's edge the half-period cells on both sides count as one; the phase decides between them.
         order = np.where(middle, half >> 1, ((half + 1) >> 1) - (part >= 0.75))
         inconsistent = np.where(middle, least, np.abs(last)) < undecided
     else:
-        ahead, behind, _ = _find_border_pixels(layout, stack, code, heights)
+        ahead, behind, _ = _detect_border_pixels(layout, stack, code, heights)
         order = code + (ahead & (part < np.float32(limits.EDGE))) - (behind & (part >= np.float32(1 - limits.EDGE)))
         inner = (part >= np.float32(limits.EDGE)) & (part < np.float32(1 - limits.EDGE))
         inconsistent = inner & (least < undecided)
@@ -170,20 +176,20 @@ def _decode_period_order(
 def _read_code(
     layout: Layout, stack: np.ndarray, bits: tuple[int, ...], background: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The binary number (h, w) int32 that Gray bits name, its last digit, and the bits' heights (b, h, w)."""
+    """Return the binary number (h, w) int32 that Gray bits encode, its last digit, and the bits' heights (b, h, w)."""
     heights = np.stack([bit_heights(layout, stack, i, background) for i in bits])
     digits = np.logical_xor.accumulate(heights > 0)  # a binary digit is the parity of all Gray bits so far
     places = 1 << np.arange(len(bits), dtype=np.int32)[::-1]
     return np.tensordot(places, digits.astype(np.int32), 1), digits[-1].astype(np.int32), heights
 
 
-def _find_border_pixels(
+def _detect_border_pixels(
     layout: Layout, stack: np.ndarray, code: np.ndarray, heights: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Where a pixel lies on the upper and on the lower border of its cell, (h, w) bool, and the least height (h, w) of
-    the bits that change at neither.
+    """Return where a pixel is at the upper and at the lower border of its cell, (h, w) bool each.
 
-    The bit that lies near the middle of black and white tells which border the pixel is at.
+    Third, the least height (h, w) of the bits that change at neither border. The bit that is near the middle of black
+    and white determines the border.
     """
     top, bottom = np.maximum(heights.max(axis=0), np.float32(0)), np.minimum(heights.min(axis=0), np.float32(0))
     mean = np.float32(fringe_mean(layout, stack))
@@ -205,25 +211,30 @@ def _find_border_pixels(
 def _decode_cell(
     layout: Layout, stack: np.ndarray, modulation: np.ndarray, background: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(coordinate px, undecided): the middle of the cell that the Gray bits name, or its border where the bit that
-    changes there lies near the middle of black and white. Undecided where any other bit is."""
+    """Return the coordinate px of the cell that the Gray bits number, and where it is undecided, (h, w) each.
+
+    The coordinate is the middle of the cell, or its border where the bit that changes there is near the middle of black
+    and white. It is undecided where any other bit is.
+    """
     code, _, heights = _read_code(layout, stack, code_bits(layout), background)
-    ahead, behind, least = _find_border_pixels(layout, stack, code, heights)
+    ahead, behind, least = _detect_border_pixels(layout, stack, code, heights)
     part = np.where(ahead, 1.0, np.where(behind, 0.0, 0.5))
     undecided = least < np.float32(limits.UNDECIDED_BIT) * modulation
     return layout.gray_origin_px + code_cell_px(layout) * (code + part), undecided
 
 
 def code_bits(layout: Layout) -> tuple[int, ...]:
-    """The frames of all Gray bits, the most significant first and the complementary one last."""
+    """Return the frames of all Gray bits, the most significant first and the complementary one last."""
     return (*layout.gray, *(() if layout.complementary is None else (layout.complementary,)))
 
 
 def _unwrap_by_levels(
     layout: Layout, wrapped: list[np.ndarray], cell: tuple[np.ndarray, np.ndarray] | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What to add to the finest wrapped phase, in periods, and where the levels contradict each other, or the cell (see
-    `_cell`) where there is one."""
+    """Return the periods to add to the finest wrapped phase, and where levels or cell are inconsistent, (h, w) each.
+
+    ``cell``: see `_decode_cell`, None without Gray code.
+    """
     levels = layout_levels(layout)
     low = lowest_coordinate(levels[0].period_px, min(layout.extent, unambiguous_px(layout)))
     _, order, turns = unwrap_levels(levels, wrapped, low, None if cell is None else cell[0])
@@ -237,7 +248,7 @@ def _unwrap_by_levels(
 def _decode_gray_alone(
     layout: Layout, stack: np.ndarray, noise: tuple[float, float]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """(phase, modulation, background, inconsistent, dark) from Gray bits alone.
+    """Return phase, modulation, background, inconsistent and dark, (h, w) each, from Gray bits alone.
 
     One undecided bit whose two readings are neighbouring columns puts the pixel on the border between them.
     """
@@ -268,7 +279,10 @@ def _decode_gray_alone(
 
 
 def measure_gray_contrast(layout: Layout, stack: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(modulation, background) of Gray code alone: half of white - black and their mean, else from the inverses."""
+    """Return modulation and background (h, w) float32 of Gray code alone, in grey levels.
+
+    Half of white - black and their mean, or else from the bits and their inverses.
+    """
     if layout.white is not None and layout.black is not None:
         white, black = (stack[i].astype(np.float32) for i in (layout.white, layout.black))
         return (white - black) * np.float32(0.5), (white + black) * np.float32(0.5)

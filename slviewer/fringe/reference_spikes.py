@@ -11,11 +11,11 @@ TWO_PI = 2 * np.pi
 
 
 def repair_spikes(layout: Layout, phase: np.ndarray, reason: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Phase and reason after a look at each pixel's neighbourhood; (h, w) each, new arrays.
+    """Return phase and reason, (h, w) each, new arrays, corrected by each pixel's neighbourhood.
 
-    A plain Gray code may be read from the wrong side of its edge: where a clear majority of the neighbours says so,
-    such a pixel is moved by the one period. What then still stands alone is INCONSISTENT. A depth step has enough
-    neighbours on its own side, and is left as it is.
+    A plain Gray code may be read on the wrong side of its edge: where a clear majority of the neighbours indicates
+    this, such a pixel is moved by the one period. A pixel that still has too few supporting neighbours is INCONSISTENT.
+    A depth step has enough neighbours on its own side, and is not changed.
     """
     rules = spike_rules(layout)
     phase, reason = phase.copy(), reason.copy()
@@ -37,10 +37,10 @@ def repair_spikes(layout: Layout, phase: np.ndarray, reason: np.ndarray) -> tupl
 
 
 def _count_votes(phase: np.ndarray, rules: SpikeRules) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
-    """Pixels that differ from one of their four neighbours, and how their window votes.
+    """Return row and column of the pixels that differ from one of their four neighbours, and the votes of their window.
 
-    ``valid`` neighbours; those that ``agree``; those that are just one cell ``above``, ``below``. The phase is
-    known modulo ``rules.repeat`` cells.
+    ``valid`` neighbours; those that ``agree``; those that are just one cell ``above``, ``below``. The phase is known
+    modulo ``rules.repeat`` cells.
     """
     margin, repeat = limits.WINDOW, rules.repeat
     padded = np.pad(phase, margin, constant_values=np.nan)

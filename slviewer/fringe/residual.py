@@ -1,10 +1,10 @@
-"""Whether the frames of a capture fit together: what each leaves unexplained, and which of them stand out.
+"""Consistency of the frames of a capture: the residual of each frame, and the frames that stand out.
 
-Phase-shifted frames are one cosine per pixel, so that more than three of them say too much, and contradict each other
-when one was late, lost or repeated. Frames of unequal light are compared as they would be under equal light. What the
-projector's gamma adds is common to all frames, and is not held against one of them; where it shifts the phase of three
-or four steps, it is reported. Frames of a Gray code contradict
-each other too: see `description_check`.
+Phase-shifted frames are one cosine per pixel, so that more than three of them are redundant, and contradict each other
+when one was late, lost or repeated. Frames of unequal light are compared as they would be under equal light. The
+harmonics that the projector's gamma adds are common to all frames, and are not counted against one of them; where they
+shift the phase of three or four steps, this is reported. Frames of a Gray code contradict each other too: see
+`description_check`.
 """
 
 from contextlib import suppress
@@ -26,7 +26,7 @@ from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.fringe.suspect import LIGHT_FAULTS, ORDER_FAULTS, Fault, Suspect
 
 SMALL_DRIFT = 0.05
-"""rms variation of the light up to which a misplaced frame is recognised without correcting the light first."""
+"""rms variation of the light up to which a misplaced frame is detected without correcting the light first."""
 _CODE_FAULTS: dict[str, Fault] = {
     "frame-lag": "lag", "frame-order": "swapped", "missing-frame": "dropped", "duplicate-frame": "late"
 }  # fmt: skip
@@ -34,11 +34,11 @@ _CODE_FAULTS: dict[str, Fault] = {
 
 @dataclass(frozen=True)
 class FrameResidual:
-    """What the cosine fitted through all frames of its period leaves in one of them.
+    """Residual of one frame from the cosine fitted through all frames of its period.
 
-    ``rms``: grey levels, over the valid pixels that were sampled; ``sigmas``: the same as a multiple of what the noise
-    leads to expect, 1 for a frame that fits. Both NaN where there are no more than three steps, or no valid pixels.
-    ``light``: relative light of this frame, 1 like the others'; NaN where it cannot be told.
+    ``rms``: grey levels, over the valid pixels that were sampled; ``sigmas``: the same as a multiple of the expected
+    noise, 1 for a frame that fits. Both NaN where there are no more than three steps, or no valid pixels. ``light``:
+    relative light of this frame, 1 like the others'; NaN where it cannot be measured.
     """
 
     frame: int
@@ -49,9 +49,9 @@ class FrameResidual:
 
 @dataclass(frozen=True)
 class FrameResiduals:
-    """The residual of each phase-shifted frame of one axis, and the frames of that axis that stand out.
+    """Residual of each phase-shifted frame of one axis, and the frames of that axis that stand out.
 
-    ``said``: in words what could not be judged, empty otherwise.
+    ``said``: text that reports which frames could not be judged, empty otherwise.
     """
 
     axis: Axis
@@ -61,27 +61,27 @@ class FrameResiduals:
 
 
 def frame_residuals(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -> FrameResiduals:
-    """How the (n, h, w) frames of one axis fit together. Raises InputError like `decode`.
+    """Measure how well the (n, h, w) frames of one axis fit each other. Raises InputError like `decode`.
 
-    About 100,000 pixels of evenly spread rows are sampled. Gamma raises `sigmas` of all frames alike; a suspect is
-    only a frame that contradicts the others.
+    About 60,000 pixels of evenly spread rows are sampled. Gamma raises `sigmas` of all frames alike; only a frame that
+    contradicts the others is a suspect.
     """
-    return _axis_residuals(_Frames(sequence, stack, estimate_frame_light(sequence, stack)), axis)
+    return _measure_axis_residuals(_Frames(sequence, stack, estimate_frame_light(sequence, stack)), axis)
 
 
 def capture_residuals(sequence: PatternSequence, stack: np.ndarray) -> list[FrameResiduals]:
-    """`frame_residuals` of each axis of a capture (n, h, w); an axis that cannot be decoded is skipped."""
+    """Return `frame_residuals` of each axis of a capture (n, h, w); an axis that cannot be decoded is skipped."""
     frames = _Frames(sequence, stack, estimate_frame_light(sequence, stack))
     residuals = []
     for axis in sequence.axes:
         with suppress(InputError):  # decoding reports it, with the remedy
-            residuals.append(_axis_residuals(frames, axis))
+            residuals.append(_measure_axis_residuals(frames, axis))
     return residuals
 
 
 @dataclass(frozen=True, eq=False)
 class _Frames:
-    """The frames of a capture, their grey levels multiplied by ``factor``, and what all axes share, computed once."""
+    """Frames of a capture, their grey levels multiplied by ``factor``, and cached results that all axes share."""
 
     sequence: PatternSequence
     stack: np.ndarray
@@ -90,39 +90,41 @@ class _Frames:
 
     @cached_property
     def equalized(self) -> "_Frames":
-        """The frames under equal light."""
+        """The frames scaled to equal light."""
         stack, factor = equalize_frames(self.stack, self.light, self.sequence)
         return _Frames(self.sequence, stack, self.light, factor)
 
     @cached_property
     def contradictions(self) -> tuple[Contradiction, ...]:
-        """What contradicts the description, phase steps aside."""
+        """Contradictions between the frames and their description, except for those of the phase steps."""
         return find_contradictions(self.sequence, self.stack, with_steps=False)
 
     def white(self, axis: Axis) -> float:
-        """Grey level at which the frames of an axis are clipped."""
+        """Return the grey level at which the frames of an axis are clipped."""
         return CLIPPED if self.factor != 1 else white_level(self.stack, self.sequence.select(axis))
 
 
-def _axis_residuals(frames: _Frames, axis: Axis) -> FrameResiduals:
-    """`frame_residuals` of one axis, of frames whose light is known."""
+def _measure_axis_residuals(frames: _Frames, axis: Axis) -> FrameResiduals:
+    """Compute `frame_residuals` of one axis for frames whose light has been estimated."""
     sequence, light = frames.sequence, frames.light
     layout = axis_layout(sequence, axis)
     if not light.is_significant:
-        return _compare(frames, layout)
+        return _compare_frames(frames, layout)
     if light.drift < SMALL_DRIFT and light.wave < SMALL_DRIFT:
-        # A frame out of its place is a simpler explanation than many frames each in a light of its own.
-        as_seen = _compare(frames, layout)
+        # One misplaced frame is a simpler explanation than different light in many frames.
+        as_seen = _compare_frames(frames, layout)
         if any(suspect.fault in ORDER_FAULTS for suspect in as_seen.suspects):
             return as_seen
-    compared = _compare(frames.equalized, layout)
+    compared = _compare_frames(frames.equalized, layout)
     if any(suspect.fault != "gamma" for suspect in compared.suspects):
-        return compared  # a frame out of its place spoils what is known of the light, too
-    return replace(compared, suspects=tuple(_deduplicate([*detect_light_faults(sequence, light), *compared.suspects])))
+        return compared  # a misplaced frame distorts the estimate of the light, too
+    return replace(
+        compared, suspects=tuple(_deduplicate_suspects([*detect_light_faults(sequence, light), *compared.suspects]))
+    )
 
 
-def _compare(frames: _Frames, layout: Layout) -> FrameResiduals:
-    """The residuals of one axis."""
+def _compare_frames(frames: _Frames, layout: Layout) -> FrameResiduals:
+    """Compute the residuals and the suspects of one axis for frames that are taken to be of equal light."""
     axis, stack, white = layout.axis, frames.stack, frames.white(layout.axis)
     noise = measure_noise(layout, stack, white)
     residuals: list[FrameResidual] = []
@@ -143,11 +145,14 @@ def _compare(frames: _Frames, layout: Layout) -> FrameResiduals:
     suspects += describe_gamma(estimate_aliased_harmonics(layout, stack, white, noise), layout)
     if layout.gray and not suspects:
         suspects += _detect_code_faults(frames, axis)
-    return FrameResiduals(axis, tuple(residuals), tuple(_deduplicate(suspects)), "; ".join(remarks))
+    return FrameResiduals(axis, tuple(residuals), tuple(_deduplicate_suspects(suspects)), "; ".join(remarks))
 
 
 def _detect_code_faults(frames: _Frames, axis: Axis) -> list[Suspect]:
-    """What contradicts the order of the frames that are no phase steps; of all frames, if they are late by as many."""
+    """Return a suspect for each contradiction in the order of the frames that are no phase steps.
+
+    Phase steps are included only if all frames are late by the same number of images.
+    """
     out = []
     for c in frames.contradictions:
         if c.cause in _CODE_FAULTS and c.axis in (axis, None) and c.value is not None:
@@ -159,7 +164,10 @@ def _detect_code_faults(frames: _Frames, axis: Axis) -> list[Suspect]:
 
 
 def _measure_residuals(sampled: Fringe, gain: np.ndarray, factor: float) -> list[FrameResidual]:
-    """The residual of each frame of one period."""
+    """Return the residual of each frame of one period.
+
+    ``gain`` (n,): relative light of each frame; ``factor``: that of `_Frames`, by which the rms is divided.
+    """
     n = sampled.steps
     if n == 3:
         return [FrameResidual(i, np.nan, np.nan, np.nan) for i in sampled.shift.indices]
@@ -174,9 +182,12 @@ def _measure_residuals(sampled: Fringe, gain: np.ndarray, factor: float) -> list
 
 
 def _estimate_relative_light(sampled: Fringe) -> np.ndarray:
-    """(n,) relative light of each frame, 1 in the middle; NaN where it cannot be told from a fringe.
+    """Estimate the relative light (n,) of each frame of a period, with median 1.
 
-    To first order a frame of light 1 + e leaves e times itself, less the part that the fit of the cosine takes up.
+    NaN where a fringe does not determine it.
+
+    To first order a frame of light 1 + e has a residual of e times itself, less the part that the fit of the cosine
+    absorbs.
     """
     n = sampled.steps
     if n == 3 or not sampled.turns:
@@ -189,8 +200,8 @@ def _estimate_relative_light(sampled: Fringe) -> np.ndarray:
     return 1 + excess - np.median(excess)
 
 
-def _deduplicate(suspects: list[Suspect]) -> list[Suspect]:
-    """Of the findings about the order of a frame the first, and all about light; in the order of the frames."""
+def _deduplicate_suspects(suspects: list[Suspect]) -> list[Suspect]:
+    """Return the first suspect about the order of each frame, and all about light, sorted by frame."""
     first_by_frame: dict[tuple[int, str], Suspect] = {}
     for suspect in suspects:
         first_by_frame.setdefault((suspect.frame, suspect.fault if suspect.fault in LIGHT_FAULTS else ""), suspect)

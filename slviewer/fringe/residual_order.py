@@ -1,8 +1,8 @@
-"""Which step each phase-shifted frame really shows.
+"""Estimation of the step that each phase-shifted frame shows.
 
-Every way in which frames can be out of order is tried as an explanation: it fits when it leaves as little as the noise,
-and it is believed when what it explains is what such a fault would have caused. Only the frames' products with each
-other are needed for that, (n, n) numbers.
+Every way in which frames can be out of order is tested as a hypothesis: it fits when its residual is as small as the
+noise, and it is accepted when it explains as much residual as such a fault would have caused. This needs only the
+frames' products with each other, (n, n) numbers.
 """
 
 from collections.abc import Iterator
@@ -16,27 +16,31 @@ from slviewer.fringe.residual_sample import Fringe, cosine_columns
 from slviewer.fringe.suspect import Fault, Suspect
 
 _AS_EXPECTED = 0.7
-"""What an explanation must explain, as a share of what its fault would have caused."""
+"""Residual that a hypothesis must explain, as a share of the residual that its fault would cause."""
 _STRANGE = 0.08
-"""rms error, as a share of the modulation, with which a frame that nothing explains is strange."""
-_STRANGE_NOISE = 5.0  # and it must exceed this many times the variance of what fits
+"""rms error, as a share of the modulation, from which a frame that no step explains is strange."""
+_STRANGE_NOISE = 5.0  # its square must also exceed this many times the variance of the other frames
 _AS_GOOD = (
-    1.3  # explanations within so many times the noise of the best, and this share of the fringe's square, are equal
+    1.3  # hypotheses within this factor of the least noise, plus this share of the squared fringe, are equally good
 )
 _AS_GOOD_FRINGE = 3e-3
 _SAME = 1e-6
-_ALIKE = 0.1  # difference of repeated frames in square, as a share of what their neighbours differ by
-_LIGHT_ALONE = 0.4  # of its difference that remains when its light is made that of the others
+_ALIKE = 0.1  # squared difference of repeated frames, as a share of the usual one between successive frames
+_LIGHT_ALONE = 0.4  # share of the squared difference that remains after scaling, if only the light differs
 _DARKEST = 0.6  # no lamp flickers by more
 _MOST_FAULTS = 3
 _FEWEST_ORDERED = 5  # of four steps and fewer every order is a turn, a reflection or an exchange of two
-_OFF_STEP = 0.25  # of a step, and of the radius, by which a frame may be off the place of its step
-_FEW_MISPLACED = 0.5  # of the frames: these have changed places, and the others are in order
+_OFF_STEP = 0.25  # tolerance of a frame's position, in steps, and of its radius
+_FEW_MISPLACED = 0.5  # share of the frames below which single frames have changed places, and the others are in order
 
 
 @dataclass(frozen=True)
 class _Hypothesis:
-    """What the frames show: `steps` by place in the order of showing, 0 for this period's first frame."""
+    """Hypothesis of a fault: the step that each frame shows.
+
+    ``steps``: step by position in the capture, 0 for this period's first frame. ``place``: position of the faulty
+    frame; ``other``: position of the frame whose pattern it shows, or the number of images of lag.
+    """
 
     fault: Fault
     steps: dict[int, int]
@@ -45,11 +49,14 @@ class _Hypothesis:
 
 
 def detect_misordered_steps(sampled: Fringe) -> list[Suspect]:
-    """The frames that do not show their own step, in words; where two explanations are equal, both are given."""
+    """Return a suspect for each frame of a period that does not show its own step.
+
+    Where two explanations are equally good, the sentence gives both.
+    """
     n = sampled.steps
     products = _Products(sampled, sampled.frames)
-    if repeated := _detect_repeated(sampled, products):
-        return [_name_fault([_Hypothesis("late", {}, k, k - 1)], sampled.shift.indices) for k in repeated]
+    if repeated := _detect_repeated_steps(sampled, products):
+        return [_report_fault([_Hypothesis("late", {}, k, k - 1)], sampled.shift.indices) for k in repeated]
     if n == 3:
         return []
     products = _choose_products(sampled, products)
@@ -60,16 +67,17 @@ def detect_misordered_steps(sampled: Fringe) -> list[Suspect]:
         if chosen is None:
             break
         accepted = chosen[0]
-        suspects.append(_name_fault(chosen, sampled.shift.indices))
+        suspects.append(_report_fault(chosen, sampled.shift.indices))
     return suspects
 
 
 def recover_step_order(sampled: Fringe) -> list[int] | None:
-    """The step that each frame of a period shows, where they are all there in an order of their own; None where the
-    frames are in their described order, apart from where it begins and which way it runs, or in none.
+    """Return the step that each frame of a period shows, if all steps are present but not in the described order.
+
+    None where the frames are in their described order, up to its first step and direction, or in no order.
 
     The frames less their mean span the plane of the vectors cos(2 pi k / n) and sin(2 pi k / n): in any orthonormal
-    basis of this plane the place of a frame is its step, turned or mirrored.
+    basis of this plane the position of a frame is its step, rotated or mirrored.
     """
     n = sampled.steps
     if n < _FEWEST_ORDERED:
@@ -91,19 +99,19 @@ def recover_step_order(sampled: Fringe) -> list[int] | None:
 
 
 def detect_foreign_frames(sampled: Fringe) -> list[Suspect]:
-    """Frames that hold a share of the image before them, or that no step explains."""
+    """Return suspects for frames that contain a share of the image before them, or that no step explains."""
     return detect_ghosting(sampled) or detect_strange_frames(sampled)
 
 
 def detect_strange_frames(sampled: Fringe) -> list[Suspect]:
-    """Frames that no step explains: what remains when order, light and ghosts have been excluded."""
+    """Return suspects for frames that no step explains, after order, light and ghosting have been excluded."""
     n = sampled.steps
     products = _choose_products(sampled, _Products(sampled, sampled.frames))
     steps = {k: k for k in range(n)}
     out: list[Suspect] = []
     while len(out) < _MOST_FAULTS:
-        residual, freedom = products.left(steps)
-        without = {k: products.left({i: s for i, s in steps.items() if i != k}) for k in steps}
+        residual, freedom = products.compute_residual(steps)
+        without = {k: products.compute_residual({i: s for i, s in steps.items() if i != k}) for k in steps}
         k = min(without, key=lambda i: without[i][0])
         rest, more = without[k]
         if more < 1:
@@ -126,7 +134,7 @@ def detect_strange_frames(sampled: Fringe) -> list[Suspect]:
 
 
 def _differs_in_light_only(sampled: Fringe, k: int) -> bool:
-    """Whether frame k is what the others lead to expect, brighter or darker."""
+    """Return whether frame ``k`` is what the other frames predict, up to a factor of brightness."""
     n, others = sampled.steps, np.delete(np.arange(sampled.steps), k)
     weights = cosine_columns(np.array([k]), n, sampled.own) @ np.linalg.pinv(cosine_columns(others, n, sampled.own))
     expected = np.einsum("k,kp->p", weights[0].astype(np.float32), sampled.frames[others])
@@ -138,11 +146,16 @@ def _differs_in_light_only(sampled: Fringe, k: int) -> bool:
 
 
 class _Products:
-    """Mean products of the frames, and of those around them, over the sampled pixels."""
+    """Mean products of the frames of a period, and of those around them, over the sampled pixels.
+
+    ``places``: positions of these frames, 0 for the period's first; ``strength``: mean square of the modulation,
+    halved.
+    """
 
     def __init__(self, sampled: Fringe, frames: np.ndarray) -> None:
+        """Compute the products of ``frames`` (n, p) and of the frames shown right before and after them."""
         first = sampled.shift.indices[0]
-        mean = frames.mean(axis=0)  # a background fits anything, and takes the large numbers with it
+        mean = frames.mean(axis=0)  # the fitted background absorbs it, and numbers become smaller
         rows = dict(enumerate(frames))
         rows |= {i - first: frame for i, frame in sampled.beside.items()}
         self.places = sorted(rows)
@@ -155,57 +168,70 @@ class _Products:
         self._fringe = (parts @ parts.T).astype(float) / parts.shape[1]
         self.strength = float(np.trace(self._fringe)) / 2
 
-    def left(self, steps: dict[int, int]) -> tuple[float, int]:
-        """Squared grey levels that remain at a pixel when the frames at these places show these steps; and freedom."""
+    def compute_residual(self, steps: dict[int, int]) -> tuple[float, int]:
+        """Return the residual of a hypothesis, squared grey levels per pixel, and its degrees of freedom.
+
+        ``steps``: the step that the frame at each position shows.
+        """
         rows = np.array([self._index[place] for place in steps])
-        projection, freedom = _residual_projector(tuple(steps.values()), self._n, self._own)
+        projection, freedom = _compute_residual_projector(tuple(steps.values()), self._n, self._own)
         return float((projection * self._products[rows[:, None], rows]).sum()), freedom
 
-    def caused(self, before: dict[int, int], after: dict[int, int]) -> float:
-        """What would remain of the fringe alone under `before`, where `after` is true; of the places of both."""
+    def predict_residual(self, before: dict[int, int], after: dict[int, int]) -> float:
+        """Return the residual that the fringe alone has under ``before`` if ``after`` is true, in squared grey levels.
+
+        Both are steps by position; only positions in both count.
+        """
         shared = [place for place in before if place in after]
-        projection, _ = _residual_projector(tuple(before[place] for place in shared), self._n, self._own)
+        projection, _ = _compute_residual_projector(tuple(before[place] for place in shared), self._n, self._own)
         fringe = cosine_columns(np.array([after[place] for place in shared]), self._n, 1)[:, 1:]
         return float(np.sum(projection * (fringe @ self._fringe @ fringe.T)))
 
-    def least(self, steps: dict[int, int], n: int) -> float:
-        """What the least of faults, one frame that is late, leaves."""
-        return min(self.caused(steps, steps | {k: k - 1}) for k in range(1, n))
+    def predict_least_residual(self, steps: dict[int, int], n: int) -> float:
+        """Return the residual that the smallest fault causes, one late frame, in squared grey levels."""
+        return min(self.predict_residual(steps, steps | {k: k - 1}) for k in range(1, n))
 
 
 @lru_cache(4096)
-def _residual_projector(steps: tuple[int, ...], n: int, own: int) -> tuple[np.ndarray, int]:
-    """(len(steps),) * 2, which takes from frames of these steps what they explain; and the freedom that remains."""
+def _compute_residual_projector(steps: tuple[int, ...], n: int, own: int) -> tuple[np.ndarray, int]:
+    """Return the (k, k) matrix that projects frames of these k steps onto their residual, and its degrees of freedom.
+
+    ``n``: steps of the period; ``own``: number of harmonics fitted per pixel.
+    """
     basis, sizes, _ = np.linalg.svd(cosine_columns(np.array(steps), n, own), full_matrices=False)
     basis = basis[:, sizes > 1e-6 * sizes[0]]
     return np.eye(len(steps)) - basis @ basis.T, len(steps) - basis.shape[1]
 
 
 def _choose_products(sampled: Fringe, products: _Products) -> _Products:
-    """The products to judge by: a frame far off its place spoils what gamma is thought to add."""
+    """Return the products to judge by: those of the corrected frames, or of the frames as captured.
+
+    A frame far out of order distorts the harmonics that are attributed to gamma.
+    """
     nominal = {k: k for k in range(sampled.steps)}
-    if products.left(nominal)[0] < _AS_EXPECTED * products.least(nominal, sampled.steps):
+    if products.compute_residual(nominal)[0] < _AS_EXPECTED * products.predict_least_residual(nominal, sampled.steps):
         return products
     raw = _Products(sampled, sampled.seen)
 
-    def lowest(judge: _Products) -> float:
-        """The least residual, per degree of freedom, of any hypothesis."""
+    def compute_lowest_residual(judge: _Products) -> float:
+        """Return the smallest residual, per degree of freedom, of any hypothesis."""
         residuals = [
-            judge.left(hypothesis.steps) for hypothesis in _list_hypotheses(nominal, judge.places, sampled.steps)
+            judge.compute_residual(hypothesis.steps)
+            for hypothesis in _list_hypotheses(nominal, judge.places, sampled.steps)
         ]
         return min((rest / more for rest, more in residuals if more >= 1), default=np.inf)
 
-    return min((products, raw), key=lowest)
+    return min((products, raw), key=compute_lowest_residual)
 
 
 def _choose_hypothesis(products: _Products, accepted: _Hypothesis, n: int) -> list[_Hypothesis] | None:
-    """The explanation to believe instead of `accepted`, if there is one, and those that are as good."""
-    residual, freedom = products.left(accepted.steps)
-    least = products.least(accepted.steps, n)
+    """Return the hypothesis to accept instead of ``accepted``, with those that are as good; None if there is none."""
+    residual, freedom = products.compute_residual(accepted.steps)
+    least = products.predict_least_residual(accepted.steps, n)
     if residual < _AS_EXPECTED * least:
         return None
     judged = [
-        (hypothesis, *products.left(hypothesis.steps))
+        (hypothesis, *products.compute_residual(hypothesis.steps))
         for hypothesis in _list_hypotheses(accepted.steps, products.places, n)
     ]
     judged = [each for each in judged if each[2] >= 1]
@@ -214,14 +240,14 @@ def _choose_hypothesis(products: _Products, accepted: _Hypothesis, n: int) -> li
     noise = min(rest / more for _, rest, more in judged)
     limit = _AS_GOOD * noise + _AS_GOOD_FRINGE * products.strength
     fitting = [each for each in judged if each[1] / each[2] <= limit]
-    # The one that explains the most frames is the most easily refuted, hence the one to believe.
+    # The hypothesis that explains the most frames is the most easily refuted, hence the one to accept.
     fine = _SAME * products.strength
-    hypothesis, rest, more = min(fitting, key=lambda each: (-each[2], round(each[1] / fine), _rank(each[0])))
+    hypothesis, rest, more = min(fitting, key=lambda each: (-each[2], round(each[1] / fine), _rank_hypothesis(each[0])))
     gain = (residual - freedom * noise) - (rest - more * noise)
-    caused = products.caused(accepted.steps, hypothesis.steps)
+    caused = products.predict_residual(accepted.steps, hypothesis.steps)
     if caused > least / 2:
         believed = gain > _AS_EXPECTED * caused
-    else:  # all steps are turned alike, and only the frames that are left out tell
+    else:  # all steps are shifted alike, and only the excluded frames differ
         believed = gain > max(_STRANGE**2 * products.strength, _STRANGE_NOISE * noise)
     if hypothesis.fault == "strange" or not believed:
         return None
@@ -229,8 +255,8 @@ def _choose_hypothesis(products: _Products, accepted: _Hypothesis, n: int) -> li
     return swaps if hypothesis.fault == "swapped" else [hypothesis]
 
 
-def _rank(hypothesis: _Hypothesis) -> int:
-    """Faults that happen often before those that do not."""
+def _rank_hypothesis(hypothesis: _Hypothesis) -> int:
+    """Return the rank of a hypothesis by how frequent its fault is, 0 for the most frequent."""
     is_neighbour = abs(hypothesis.place - hypothesis.other) == 1
     if hypothesis.fault in ("late", "early"):
         return (0 if hypothesis.fault == "late" else 4) if is_neighbour else 5
@@ -238,7 +264,10 @@ def _rank(hypothesis: _Hypothesis) -> int:
 
 
 def _list_hypotheses(accepted: dict[int, int], places: list[int], n: int) -> Iterator[_Hypothesis]:
-    """All that may have happened to the frames besides what is known already, the simplest first."""
+    """Yield all hypotheses of a further fault besides those in ``accepted``, the simplest first.
+
+    ``places``: positions of the frames whose products are known; ``n``: number of steps.
+    """
     for k in range(n):
         for j in (k - 1, k + 1, *range(n)):
             if 0 <= j < n and j != accepted.get(k):
@@ -264,14 +293,14 @@ def _list_hypotheses(accepted: dict[int, int], places: list[int], n: int) -> Ite
         yield _Hypothesis("dropped", {j: j + 1 for j in range(-1, n - 1)}, 0)
 
 
-def _name_fault(hypotheses: list[_Hypothesis], indices: tuple[int, ...]) -> Suspect:
-    """The suspect for hypotheses that explain the frames equally well."""
-    texts = list(dict.fromkeys(_describe(hypothesis, indices) for hypothesis in hypotheses))
+def _report_fault(hypotheses: list[_Hypothesis], indices: tuple[int, ...]) -> Suspect:
+    """Return the suspect for hypotheses that explain the frames equally well."""
+    texts = list(dict.fromkeys(_describe_hypothesis(hypothesis, indices) for hypothesis in hypotheses))
     return Suspect(indices[hypotheses[0].place], hypotheses[0].fault, ", or ".join(texts))
 
 
-def _describe(hypothesis: _Hypothesis, indices: tuple[int, ...]) -> str:
-    """The sentence for the operator; frames are counted from 1."""
+def _describe_hypothesis(hypothesis: _Hypothesis, indices: tuple[int, ...]) -> str:
+    """Return the sentence that reports a hypothesis to the operator; frames are counted from 1."""
     frame = indices[hypothesis.place] + 1
     other = indices[hypothesis.other] + 1 if hypothesis.other < len(indices) else frame
     if hypothesis.fault == "late":
@@ -286,10 +315,10 @@ def _describe(hypothesis: _Hypothesis, indices: tuple[int, ...]) -> str:
     return f"from frame {frame} on the camera is {images} behind the projector"
 
 
-def _detect_repeated(sampled: Fringe, products: _Products) -> list[int]:
-    """Steps that are the frame before once more, where any two that follow each other should differ alike."""
+def _detect_repeated_steps(sampled: Fringe, products: _Products) -> list[int]:
+    """Return the steps whose frame repeats the frame before it, judged by the usual difference of successive frames."""
     n, seen = sampled.steps, sampled.seen
-    if n == 3 and not sampled.turns:  # two steps look alike where the pixels see one side of the fringe alone
+    if n == 3 and not sampled.turns:  # two steps look alike where the pixels cover one side of the fringe only
         return []
     differences = np.array([float(np.mean((seen[k] - seen[k - 1]) ** 2)) for k in range(1, n)])
     noise = 2 * sampled.roughness**2
@@ -300,6 +329,6 @@ def _detect_repeated(sampled: Fringe, products: _Products) -> list[int]:
     if n == 3 or len(alike) > _MOST_FAULTS:
         return alike[:1] if n == 3 else []
     nominal = {k: k for k in range(n)}
-    residual, _ = products.left(nominal)
-    rest, _ = products.left({k: k for k in range(n) if k not in alike})
-    return alike if rest < residual / 2 and residual > products.least(nominal, n) / 3 else []
+    residual, _ = products.compute_residual(nominal)
+    rest, _ = products.compute_residual({k: k for k in range(n) if k not in alike})
+    return alike if rest < residual / 2 and residual > products.predict_least_residual(nominal, n) / 3 else []

@@ -1,4 +1,4 @@
-"""A sample of the pixels that see fringes, and the cosine through each of them."""
+"""Sample of the pixels with fringes, and the cosine fitted to each of them."""
 
 from dataclasses import dataclass
 
@@ -8,25 +8,25 @@ from slviewer.fringe import limits
 from slviewer.fringe.layout import Shift
 
 PIXELS = 60_000
-"""So many are looked at: their statistics are good to half a percent."""
+"""Number of sampled pixels: their statistics are accurate to half a percent."""
 FEWEST = 500
-"""Fewer valid pixels than this say nothing about a frame."""
+"""Number of valid pixels below which a frame is not judged."""
 BESIDE = 2
-"""So many frames before and after those of a period are compared with them."""
+"""Number of frames before and after those of a period that are compared with them."""
 HIGHEST = 6
-"""The highest harmonic of the fringe that gamma is thought to make."""
+"""The highest harmonic of the fringe that is attributed to gamma."""
 _ONE_SIDED = 0.5
-_OUTLIER_CLIPS = 0.5  # a frame that alone clips so many pixels shows something else, and must not hide itself
+_OUTLIER_CLIPS = 0.5  # a frame that alone clips more of the pixels shows something else, and does not count as clipped
 
 
 @dataclass(frozen=True, eq=False)
 class Fringe:
-    """The frames of one period at p valid pixels, float32 grey levels.
+    """Frames of one period at p valid pixels, float32 grey levels.
 
-    ``seen``, ``frames`` and ``fitted`` (n, p): as seen; less what gamma adds in all of them; and background +
-    modulation cos. ``beside``: frames shown right before and after these, by index, (p,) each. ``phasor`` (p,)
-    complex64, modulation e^(i phase). ``keep`` (n, n) takes the residual from frames: what a background and harmonics
-    1 ... `own` do not explain. ``roughness``: grey levels by which neighbouring pixels differ, noise and texture.
+    ``seen``, ``frames`` and ``fitted`` (n, p): as captured; less the harmonics that gamma adds to all of them; and
+    background + modulation cos. ``beside``: frames shown right before and after these, by index, (p,) each. ``phasor``
+    (p,) complex64, modulation e^(i phase). ``own``: number of harmonics fitted per pixel. ``noise``: (a, b), see
+    `noise.measure_noise`. ``roughness``: grey levels by which neighbouring pixels differ, noise and texture.
     """
 
     shift: Shift
@@ -41,36 +41,45 @@ class Fringe:
 
     @property
     def steps(self) -> int:
-        """How many there are."""
+        """Number of phase steps."""
         return len(self.frames)
 
     @property
     def keep(self) -> np.ndarray:
-        """See the class."""
+        """Matrix (n, n) that projects frames onto their residual.
+
+        It removes a background and the harmonics up to ``own``.
+        """
         basis, _ = np.linalg.qr(cosine_columns(np.arange(self.steps), self.steps, self.own))
         return np.eye(self.steps) - basis @ basis.T
 
     @property
     def turns(self) -> bool:
-        """Whether the pixels see the fringe in all its phases, which tells a change of light from one of phase."""
+        """Whether the pixels cover all phases of the fringe; only then can light and phase changes be separated."""
         return abs(complex(np.mean(self.phasor / np.maximum(np.abs(self.phasor), 1e-6)))) < _ONE_SIDED
 
 
 def cosine_columns(steps: np.ndarray, n: int, own: int) -> np.ndarray:
-    """(len(steps), 1 + 2 own): what a pixel may show at each step of n: a constant, cosines and sines."""
+    """Return the design matrix (len(steps), 1 + 2 own) of a fringe: constant, cosines and sines at each step of n.
+
+    ``own``: number of harmonics.
+    """
     angle = 2 * np.pi * np.asarray(steps, float) / n
     harmonics = [f(h * angle) for h in range(1, own + 1) for f in (np.cos, np.sin)]
     return np.stack([np.ones_like(angle), *harmonics], axis=1)
 
 
 def select_rows(height: int, width: int, pixels: int = PIXELS) -> np.ndarray:
-    """Evenly spread rows that hold about so many pixels."""
+    """Return the indices of evenly spread rows that hold about ``pixels`` pixels."""
     count = min(height, max(1, round(pixels / width)))
     return np.unique(np.linspace(0, height - 1, count).round().astype(int))
 
 
 def sample_fringe(stack: np.ndarray, shift: Shift, noise: tuple[float, float], white: float) -> Fringe | None:
-    """The sampled fringes of one period; None where too few pixels see any."""
+    """Return the sampled fringes of one period of a stack (n, h, w); None where too few pixels are modulated.
+
+    ``noise``: (a, b) of the grey levels; ``white``: level at which the camera clips.
+    """
     rows = select_rows(*stack.shape[1:])
     frames = np.stack([stack[i][rows].ravel() for i in shift.indices])
     clipped = (frames >= white) | (frames == 0)
@@ -89,27 +98,34 @@ def sample_fringe(stack: np.ndarray, shift: Shift, noise: tuple[float, float], w
         return None
     levels, background, phasor = frames[:, valid], background[valid], phasor[valid]
     frames = levels
-    # n steps leave harmonics of each pixel's own to fit, as long as enough remains to contradict.
+    # Harmonics are fitted to each pixel as long as enough degrees of freedom remain.
     own = 2 if n >= 10 else 1
     if n > 3:
         frames = levels - fit_common_harmonics(levels, phasor, own)
         background, phasor = fit_cosine(frames)
     angle = (2 * np.pi * np.arange(n) / n)[:, None]
     fitted = background + np.real(phasor * np.exp(1j * angle).astype(np.complex64))
-    neighbours = {i: stack[i][rows].ravel()[valid].astype(np.float32) for i in _neighbours(shift.indices, len(stack))}
+    neighbours = {
+        i: stack[i][rows].ravel()[valid].astype(np.float32) for i in _list_adjacent_frames(shift.indices, len(stack))
+    }
     return Fringe(shift, levels, frames, fitted, neighbours, phasor, own, noise, rough)
 
 
 def estimate_roughness(frames: np.ndarray, width: int) -> float:
-    """Grey levels by which neighbours along a row differ from a smooth curve; a fault of a frame does not enter it. At
-    least 0.29, the noise of rounding: dark and saturated pixels do not differ at all.
+    """Return the grey levels by which neighbours along a row deviate from a smooth curve, at least 0.29.
+
+    ``frames`` (n, p) of whole rows of ``width`` pixels. A fault of a frame does not affect it. The minimum is the noise
+    of rounding: dark and saturated pixels do not differ at all.
     """
     third = np.diff(frames.reshape(len(frames), -1, width), n=3, axis=-1)
     return max(float(np.median(np.abs(third))) / (0.6745 * np.sqrt(20)), 12**-0.5)  # 1 + 9 + 9 + 1 variances
 
 
 def fit_cosine(frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Background (p,) float32 and modulation e^(i phase) (p,) complex64, for a positive sign of the phase shift."""
+    """Return background (p,) float32 and modulation e^(i phase) (p,) complex64 of ``frames`` (n, p), equidistant steps.
+
+    The phase is that of a positive phase sign.
+    """
     n = len(frames)
     wave = np.exp(-2j * np.pi * np.arange(n) / n).astype(np.complex64) * np.float32(2 / n)
     phasor = np.empty(frames.shape[1], np.complex64)
@@ -118,9 +134,9 @@ def fit_cosine(frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def fit_common_harmonics(frames: np.ndarray, phasor: np.ndarray, own: int) -> np.ndarray:
-    """(n, p): the harmonics beyond `own` that all pixels have in common, each with its own fringe's phase and strength.
+    """Fit the harmonics beyond ``own`` that all pixels share, with each fringe's phase and strength; returns (n, p).
 
-    Harmonic m of the fringe appears among n steps as the m-th, or as the one that it cannot be told from.
+    Harmonic m of the fringe appears among n steps as the m-th, or as its alias.
     """
     n = len(frames)
     strength = np.abs(phasor)
@@ -148,8 +164,8 @@ def fit_common_harmonics(frames: np.ndarray, phasor: np.ndarray, own: int) -> np
     return added
 
 
-def _neighbours(indices: tuple[int, ...], count: int) -> list[int]:
-    """Frames shown up to ``BESIDE`` before and after, where these were shown one after the other."""
+def _list_adjacent_frames(indices: tuple[int, ...], count: int) -> list[int]:
+    """Return the frames up to ``BESIDE`` before and after a period; none if its frames are not consecutive."""
     if indices != tuple(range(indices[0], indices[0] + len(indices))):
         return []
     first, last = max(indices[0] - BESIDE, 0), min(indices[-1] + BESIDE + 1, count)

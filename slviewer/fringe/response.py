@@ -1,4 +1,4 @@
-"""How the light that a camera sees grows with the grey level that a projector is told to show.
+"""Response of the light that a camera measures to the grey level that a projector shows.
 
 A response is given as `shown` (n,) grey levels, increasing from 0 to 255, and `seen` (n,) light, 0 for dark and 1 for
 white, noise included. Between them it is a monotone piecewise cubic (PCHIP).
@@ -14,20 +14,20 @@ _FINE = 16  # places per grey level at which a response is tabulated before it i
 
 
 def fit_gamma(shown: np.ndarray, seen: np.ndarray) -> float:
-    """The exponent of the power of shown / 255 that comes nearest to the response."""
+    """Fit the exponent of the power of shown / 255 that approximates the response best."""
     x, y = _check_response(shown, seen)
     fit = minimize_scalar(lambda g: float(np.sum((x**g - y) ** 2)), bounds=(0.2, 5.0), method="bounded")
     return float(fit.x)
 
 
 def measure_nonlinearity(shown: np.ndarray, seen: np.ndarray) -> float:
-    """The largest distance of the response from a straight line, as a share of white."""
+    """Return the largest distance of the response from a straight line, as a share of white."""
     x, y = _check_response(shown, seen)
     return float(np.abs(y - x).max())
 
 
 def predict_phase_error(shown: np.ndarray, seen: np.ndarray, steps: int) -> float:
-    """The rms error of the phase in rad that the response causes in `steps` phase steps, without any blur."""
+    """Predict the rms error of the phase, rad, that the response causes in `steps` phase steps, without any blur."""
     curve = _fit_monotonic_curve(shown, seen)
     phase = 2 * np.pi * np.arange(360) / 360
     k = 2 * np.pi * np.arange(steps)[:, None] / steps
@@ -37,7 +37,10 @@ def predict_phase_error(shown: np.ndarray, seen: np.ndarray, steps: int) -> floa
 
 
 def linearise_levels(shown: np.ndarray, seen: np.ndarray) -> tuple[int, ...]:
-    """For `PatternSequence.levels`: the 256 grey levels to show so that the light grows evenly from dark to white."""
+    """Return the 256 grey levels to show so that the light grows evenly from dark to white.
+
+    These are `PatternSequence.levels`.
+    """
     x = np.arange(255 * _FINE + 1) / (255 * _FINE)
     y = np.maximum.accumulate(_fit_monotonic_curve(shown, seen)(x))
     levels = np.rint(255 * np.interp(np.arange(256) / 255, y, x)).astype(int)
@@ -46,7 +49,7 @@ def linearise_levels(shown: np.ndarray, seen: np.ndarray) -> tuple[int, ...]:
 
 
 def _fit_monotonic_curve(shown: np.ndarray, seen: np.ndarray) -> PchipInterpolator:
-    """Interpolator of the response, made monotonic: noise must not reverse it."""
+    """Fit an interpolator to the response, made monotonic: noise must not reverse it."""
     x, y = _check_response(shown, seen)
     rising = (np.maximum.accumulate(y) + np.minimum.accumulate(y[::-1])[::-1]) / 2  # noise must not turn it round
     rising[0], rising[-1] = 0.0, 1.0
@@ -54,7 +57,7 @@ def _fit_monotonic_curve(shown: np.ndarray, seen: np.ndarray) -> PchipInterpolat
 
 
 def _check_response(shown: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Grey levels (0 to 1) and light as arrays; raises InputError where they are no response."""
+    """Return grey levels (0 to 1) and light as float arrays. Raises InputError where they are no response."""
     x, y = np.asarray(shown, float) / 255, np.asarray(seen, float)
     if x.ndim != 1 or x.shape != y.shape or len(x) < 3 or x[0] != 0 or x[-1] != 1 or (np.diff(x) <= 0).any():
         raise InputError("a response needs three or more grey levels that rise from 0 to 255, and the light of each")

@@ -1,7 +1,7 @@
-"""Noise of the phase from neighbouring pixels: what no residual over the phase steps contains.
+"""Noise of the phase measured from neighbouring pixels, which includes what the residual over phase steps does not.
 
-Lossy compression adds errors that lie partly in the fringe's own harmonic. The n steps of a pixel fit these as well as
-the fringe itself, so that the noise of grey levels explains too little; but the phase of a smooth surface then scatters
+Lossy compression adds errors that are partly in the fringe's own harmonic. The n steps of a pixel fit these as well as
+the fringe itself, so that the noise of grey levels predicts too little; but the phase of a smooth surface then scatters
 more than predicted from pixel to pixel, or, where JPEG has smoothed its blocks of 8 x 8 pixels, from block to block.
 """
 
@@ -16,12 +16,12 @@ WINDOW = 16
 WINDOWS = 14
 """Windows that are sampled along a column of the image, and along a row."""
 FEWEST = 30
-"""Fewer valid windows say nothing."""
+"""Number of valid windows below which the scatter is not measured."""
 BLOCK = 8
 """px: side of a block of JPEG, and of the parts of a window whose third differences are averaged."""
 QUANTILE = 0.25
-"""Of the blocks' ratios of observed to predicted variance decides whether the prediction holds: up to three quarters of
-a scene may be edges and texture."""
+"""Quantile of the blocks' ratios of observed to predicted variance that is used: up to three quarters of a scene may be
+edges and texture."""
 SIGNIFICANT = 2.0
 """Times the predicted standard deviation, below which none is raised without compression: the relief of an object,
 which is no noise, reaches 1.3."""
@@ -29,15 +29,17 @@ BLOCKINESS = 1.5
 """Third differences across the borders of blocks over those inside, from which an image counts as compressed: without
 compression noise leaves it within 1.15, with JPEG of quality 85 it is 2 to 3."""
 ROUNDING = 1 / 12
-"""Variance of a rounded grey level: frames without noise still have it, and residuals may not see it."""
+"""Variance of a rounded grey level: frames without noise still have it, and residuals may not include it."""
 _VARIANCES = 20.0  # of a third difference: 1 + 9 + 9 + 1
 _FREEDOM = 25.0  # of the mean over a block: its differences overlap
 
 
 @dataclass(frozen=True)
 class Scatter:
-    """``ratio``: observed over predicted standard deviation of the phase; NaN where too little is seen.
-    ``blockiness``: phase differences across the borders of a grid of 8 x 8 pixels over those inside; 1 without a grid.
+    """Scatter of the phase between neighbouring pixels.
+
+    ``ratio``: observed over predicted standard deviation of the phase; NaN for too few valid pixels. ``blockiness``:
+    phase differences across the borders of a grid of 8 x 8 pixels over those inside; 1 without a grid.
     """
 
     ratio: float
@@ -45,21 +47,19 @@ class Scatter:
 
     @property
     def is_compressed(self) -> bool:
-        """Whether the frames went through JPEG."""
+        """Whether the frames were compressed as JPEG."""
         return self.blockiness > BLOCKINESS
 
 
 def with_scatter(phase: PhaseMap) -> PhaseMap:
-    """The same phase map with a ``sigma_scale`` as measured, where it is significant."""
+    """Return the phase map with the measured ``sigma_scale``, where it is significant."""
     scatter = measure_scatter(phase)
     raised = scatter.ratio > (1.0 if scatter.is_compressed else SIGNIFICANT)
     return replace(phase, sigma_scale=scatter.ratio) if raised else phase
 
 
 def measure_scatter(phase: PhaseMap) -> Scatter:
-    """How the phase scatters between neighbouring pixels of smooth surfaces, compared with what ``phase.noise``
-    predicts.
-    """
+    """Measure the scatter of the phase between neighbouring pixels of smooth surfaces, relative to ``phase.noise``."""
     if not phase.steps or min(phase.phase.shape) < WINDOW:
         return Scatter(np.nan, 1.0)
     where, first = _select_valid_windows(phase)
@@ -74,9 +74,9 @@ def measure_scatter(phase: PhaseMap) -> Scatter:
     predicted *= np.float32(2 / phase.steps) / np.maximum(phase.modulation[where], np.float32(1e-6)) ** 2
     predicted += np.float32(phase.model_error_rad**2)
     if blockiness > BLOCKINESS:
-        ratio = float(np.median(_window_variance(values) / predicted.mean(axis=(1, 2))))
+        ratio = float(np.median(_compute_window_variance(values) / predicted.mean(axis=(1, 2))))
         return Scatter(float(np.sqrt(ratio)), blockiness)
-    ratios = np.sort(_block_variance(values) / _split_blocks(predicted).mean(axis=(1, 2)))
+    ratios = np.sort(_compute_block_variance(values) / _split_blocks(predicted).mean(axis=(1, 2)))
     # A chi squared of so many degrees of freedom has its quantile here (Wilson and Hilferty 1931).
     spread = 2 / (9 * _FREEDOM)
     expected = (1 - spread - 0.6745 * np.sqrt(spread)) ** 3
@@ -84,8 +84,10 @@ def measure_scatter(phase: PhaseMap) -> Scatter:
 
 
 def _select_valid_windows(phase: PhaseMap) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
-    """Indices (m, WINDOW, WINDOW) of rows and columns, and the first ones (m, 2), of evenly spread windows in which
-    every pixel is valid."""
+    """Return pixel indices of evenly spread windows in which every pixel is valid.
+
+    Rows and columns (m, WINDOW, WINDOW), and those of the first pixel (m, 2).
+    """
     height, width = phase.phase.shape
     corners = [
         np.unique(np.linspace(0, size - WINDOW, min(WINDOWS, size // WINDOW)).astype(int)) for size in (height, width)
@@ -98,7 +100,10 @@ def _select_valid_windows(phase: PhaseMap) -> tuple[tuple[np.ndarray, np.ndarray
 
 
 def _measure_blockiness(third: np.ndarray, first: np.ndarray) -> float:
-    """From sizes of third differences (m, lines, WINDOW - 3) along the last axis of windows that begin at ``first``."""
+    """Measure the blockiness, see `Scatter`, from sizes of third differences (m, lines, WINDOW - 3).
+
+    The differences are along the last axis; ``first`` (m,): px at which each window begins along it.
+    """
     offset = (first[:, None] + np.arange(third.shape[2])) % BLOCK
     size = third.mean(axis=1)
     sizes = np.array([np.median(size[offset == k]) if (offset == k).any() else np.nan for k in range(BLOCK)])
@@ -109,8 +114,8 @@ def _measure_blockiness(third: np.ndarray, first: np.ndarray) -> float:
     return float(sizes[k] / max(np.median(sizes), sizes[(k + BLOCK // 2) % BLOCK], 1e-12))
 
 
-def _window_variance(values: np.ndarray) -> np.ndarray:
-    """(m,) variance of (m, WINDOW, WINDOW) about the cubic surface through each window."""
+def _compute_window_variance(values: np.ndarray) -> np.ndarray:
+    """Return the variance (m,) of windows (m, WINDOW, WINDOW) about the cubic surface fitted to each."""
     x = np.linspace(-1, 1, WINDOW)
     powers = [(i, j) for i in range(4) for j in range(4 - i)]
     basis, _ = np.linalg.qr(np.stack([np.outer(x**i, x**j).ravel() for i, j in powers], axis=1))
@@ -119,15 +124,15 @@ def _window_variance(values: np.ndarray) -> np.ndarray:
     return np.asarray(remaining / (WINDOW**2 - len(powers)))
 
 
-def _block_variance(values: np.ndarray) -> np.ndarray:
-    """(4 m,) variance from third differences along rows and columns of each block of the windows."""
+def _compute_block_variance(values: np.ndarray) -> np.ndarray:
+    """Return the variance (4 m,) of each block of the windows, from third differences along rows and columns."""
     blocks = _split_blocks(values)
     squares = [(np.diff(blocks, n=3, axis=axis) ** 2).mean(axis=(1, 2)) for axis in (1, 2)]
     return np.asarray((squares[0] + squares[1]) / (2 * _VARIANCES))
 
 
 def _split_blocks(windows: np.ndarray) -> np.ndarray:
-    """(4 m, BLOCK, BLOCK) of (m, WINDOW, WINDOW)."""
+    """Split windows (m, WINDOW, WINDOW) into blocks (4 m, BLOCK, BLOCK)."""
     parts = WINDOW // BLOCK
     split = windows.reshape(-1, parts, BLOCK, parts, BLOCK)
     return split.transpose(0, 1, 3, 2, 4).reshape(-1, BLOCK, BLOCK)

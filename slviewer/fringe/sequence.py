@@ -1,4 +1,4 @@
-"""What is projected, frame by frame."""
+"""Description of the projected patterns, frame by frame."""
 
 from collections import Counter
 from collections.abc import Mapping
@@ -21,7 +21,7 @@ _FIELDS = {
     "black": (),
     "texture": (),
 }
-"""What a frame of each kind must say about itself."""
+"""Fields that a frame of each kind must define."""
 
 SEQUENCE_KEYS = (
     "projector", "phase_sign", "phase_offset", "gray_origin", "gray_cell_px", "relative", "levels", "frame",
@@ -30,7 +30,7 @@ SEQUENCE_KEYS = (
 
 
 class PerAxis(NamedTuple, Generic[T]):
-    """A value of axis x and one of axis y."""
+    """Pair of a value for axis x and one for axis y."""
 
     x: T
     y: T
@@ -55,6 +55,7 @@ class Frame:
     bits: int = 0
 
     def __post_init__(self) -> None:
+        """Raise InputError where the fields of the frame are missing or out of range."""
         if self.kind not in get_args(Kind):
             raise InputError(f"frame kind '{self.kind}' is unknown: use one of {', '.join(get_args(Kind))}")
         if self.axis not in (None, "x", "y"):
@@ -72,7 +73,7 @@ class Frame:
             raise InputError(f"Gray bit {self.bit} does not exist: count from 0, the most significant")
 
     def to_dict(self) -> dict[str, Any]:
-        """The fields that matter for its kind, in the words of the `frames` TOML."""
+        """Return the fields that apply to the kind of the frame, with the keys of the `frames` TOML."""
         return (
             {"kind": self.kind}
             | ({"axis": self.axis} if self.axis else {})
@@ -81,7 +82,7 @@ class Frame:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> "Frame":
-        """The frame of a `[[frame]]` table or of `to_dict`; entries that its kind does not need are ignored."""
+        """Return the frame of a `[[frame]]` table or of `to_dict`; entries that its kind does not need are ignored."""
         known = {"kind", "axis", "step", "steps", "period_px", "bit", "bits"}
         unknown = sorted(set(data) - known - {"file"})
         if unknown:
@@ -102,21 +103,20 @@ class Frame:
 
 @dataclass(frozen=True)
 class PatternSequence:
-    """The frames of one capture, in the order in which they are shown, and the conventions they follow.
+    """Frames of one capture, in the order in which they are shown, and the conventions that they follow.
 
-    ``projector_size`` is (width, height) in px, None where it is not known. Phase step k of n shows
-    A + B cos(phi + phase_sign 2 pi k / n + phase_offset_rad). ``gray_origin_px`` is the projector coordinate at which
-    Gray code 0 begins; a displayed column u reaches from u - 0.5 to u + 0.5, hence -0.5. ``gray_cell_px`` is the width
-    of the cells that the Gray bits number (the complementary bit halves them); None: the longest fringe period, or 1 px
-    for Gray code alone. These four are one value for both axes, or a `PerAxis`.
+    ``projector_size`` is (width, height) in px, None where it is not known. Phase step k of n shows A + B cos(phi +
+    phase_sign 2 pi k / n + phase_offset_rad). ``gray_origin_px`` is the projector coordinate at which Gray code 0
+    begins; a displayed column u reaches from u - 0.5 to u + 0.5, hence -0.5. ``gray_cell_px`` is the width of the cells
+    that the Gray bits number (the complementary bit halves them); None: the longest fringe period, or 1 px for Gray
+    code alone. These four are one value for both axes, or a `PerAxis`.
 
     ``relative``: an axis of phase steps alone, whose periods do not cover the projector, is decoded modulo the longest
-    range that they tell apart; otherwise it is refused. Without a projector size such an axis is always relative.
-    ``levels``: for each grey level 0 ... 255 of a cosine the one that is shown in its place, so that a projector whose
-    light is not proportional to it shows cosines; None where they are the same. It records what was shown, and decoding
-    has no use for it.
+    unambiguous range; otherwise it is refused. Without a projector size such an axis is always relative. ``levels``:
+    for each grey level 0 ... 255 of a cosine the one that is shown in its place, so that a projector whose light is not
+    proportional to it shows cosines; None where they are the same. It records what was shown; decoding does not use it.
 
-    Raises InputError when steps or bits are missing, double, or contradict each other, or a value is none that can be.
+    Raises InputError when steps or bits are missing, repeated, or contradict each other, or a value is out of range.
     """
 
     projector_size: tuple[int, int] | None
@@ -129,6 +129,7 @@ class PatternSequence:
     relative: bool = False
 
     def __post_init__(self) -> None:
+        """Check the frames and conventions, and replace pairs of equal values by one value. Raises InputError."""
         size = self.projector_size
         if size is not None and (len(size) != 2 or min(size) < 1):
             raise InputError(f"a projector of {size} px does not exist: give width and height, like 912x1140")
@@ -146,7 +147,7 @@ class PatternSequence:
 
     @property
     def projector(self) -> tuple[int, int]:
-        """(width, height) in px. Raises InputError where the size is not known."""
+        """Projector size (width, height) in px. Raises InputError where it is not known."""
         if self.projector_size is None:
             raise InputError(
                 "the size of the projector is not known, and it is needed here: import the capture again with "
@@ -156,45 +157,45 @@ class PatternSequence:
 
     @property
     def axes(self) -> tuple[Axis, ...]:
-        """The axes that carry a pattern, x before y."""
+        """Axes that carry a pattern, x before y."""
         coded = {f.axis for f in self.frames if "axis" in _FIELDS[f.kind]}
         return tuple(axis for axis in get_args(Axis) if axis in coded)
 
     def extent(self, axis: Axis) -> int:
-        """Projector px along the axis: columns for x, rows for y."""
+        """Return the projector size along the axis, px: columns for x, rows for y."""
         return self.projector[0] if axis == "x" else self.projector[1]
 
     def periods_px(self, axis: Axis) -> tuple[float, ...]:
-        """The phase-shifted periods of the axis, longest first; empty for Gray code alone."""
+        """Return the phase-shifted periods of the axis, longest first; empty for Gray code alone."""
         return tuple(sorted({f.period_px for f in self.frames if f.kind == "phase" and f.axis == axis}, reverse=True))
 
     def period_px(self, axis: Axis) -> float:
-        """The finest period; the width of a Gray cell for Gray code alone."""
+        """Return the finest period, px; the width of a Gray cell for Gray code alone."""
         periods = self.periods_px(axis)
         return periods[-1] if periods else self.gray_cell(axis)
 
     def sign(self, axis: Axis) -> int:
-        """``phase_sign`` of the axis."""
-        return _axis_value(self.phase_sign, axis)
+        """Return ``phase_sign`` of the axis, 1 or -1."""
+        return _select_axis_value(self.phase_sign, axis)
 
     def offset_rad(self, axis: Axis) -> float:
-        """``phase_offset_rad`` of the axis."""
-        return float(_axis_value(self.phase_offset_rad, axis))
+        """Return ``phase_offset_rad`` of the axis."""
+        return float(_select_axis_value(self.phase_offset_rad, axis))
 
     def origin_px(self, axis: Axis) -> float:
-        """``gray_origin_px`` of the axis."""
-        return _axis_value(self.gray_origin_px, axis)
+        """Return ``gray_origin_px`` of the axis."""
+        return _select_axis_value(self.gray_origin_px, axis)
 
     def gray_cell(self, axis: Axis) -> float:
-        """px: width of the cells that the Gray bits of the axis number."""
-        cell = _axis_value(self.gray_cell_px, axis)
+        """Return the width, px, of the cells that the Gray bits of the axis number."""
+        cell = _select_axis_value(self.gray_cell_px, axis)
         if cell is not None:
             return float(cell)
         periods = self.periods_px(axis)
         return periods[0] if periods else 1.0
 
     def select(self, axis: Axis) -> list[int]:
-        """Indices of the frames that decoding this axis needs: its own, and white and black."""
+        """Return the indices of the frames that decoding this axis needs: its own, and white and black."""
         return [
             i
             for i, f in enumerate(self.frames)
@@ -203,11 +204,11 @@ class PatternSequence:
         ]
 
     def find(self, kind: Kind, axis: Axis) -> list[int]:
-        """Indices of the axis' frames of one kind, in order."""
+        """Return the indices of the axis' frames of one kind, in order."""
         return [i for i in self.select(axis) if self.frames[i].kind == kind]
 
     def phase_shifts(self, axis: Axis) -> tuple[tuple[float, tuple[int, ...]], ...]:
-        """(period px, frame indices by step) of each phase shift of the axis, longest period first."""
+        """Return (period px, frame indices by step) of each phase shift of the axis, longest period first."""
         steps = sorted(self.find("phase", axis), key=lambda i: self.frames[i].step)
         return tuple(
             (period, tuple(i for i in steps if self.frames[i].period_px == period)) for period in self.periods_px(axis)
@@ -222,7 +223,7 @@ class PatternSequence:
                 f"axis {axis}: phase_offset is {self.offset_rad(axis)} rad and gray_origin {self.origin_px(axis)} px: "
                 "give finite numbers"
             )
-        cell = _axis_value(self.gray_cell_px, axis)
+        cell = _select_axis_value(self.gray_cell_px, axis)
         if cell is not None and not (isfinite(cell) and cell > 0):
             raise InputError(f"axis {axis}: a Gray cell of {cell} px does not exist: give its width in projector px")
 
@@ -245,14 +246,14 @@ class PatternSequence:
         complementary = len(self.find("complementary", axis))
         # `bits` of a foreign description may or may not count the complementary bit; the frames themselves decide,
         # yet a least significant bit that was announced and is absent must not pass for a shorter code.
-        said = {f.bits for f in self.frames if f.kind == "gray" and f.axis == axis and f.bits}
-        if len(said) > 1:
+        stated_counts = {f.bits for f in self.frames if f.kind == "gray" and f.axis == axis and f.bits}
+        if len(stated_counts) > 1:
             raise InputError(
-                f"axis {axis}: the frames speak of {_join_numbers(said)} Gray bits: they must all say the same"
+                f"axis {axis}: the frames speak of {_join_numbers(stated_counts)} Gray bits: they must all say the same"
             )
         needed = max([b + 1 for b in gray + inverse], default=0)
-        if said:
-            needed = max(needed, said.pop() - min(complementary, 1))
+        if stated_counts:
+            needed = max(needed, stated_counts.pop() - min(complementary, 1))
         _check_complete(gray, range(needed), f"axis {axis}: Gray bit")
         if inverse:
             _check_complete(inverse, range(needed), f"axis {axis}: inverse of Gray bit")
@@ -262,26 +263,29 @@ class PatternSequence:
             raise InputError(f"axis {axis}: a complementary bit without phase steps says nothing: call it a Gray bit")
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values for JSON or TOML, in the words of the `frames` TOML; what was added later only where it is used,
-        so that descriptions that were written before, and their hashes, stay as they are."""
+        """Return plain values for JSON or TOML, with the keys of the `frames` TOML.
+
+        Entries that were added in later versions appear only where they are used, so that descriptions written before,
+        and their hashes, do not change.
+        """
         size = self.projector_size
         values: dict[str, Any] = {"projector": f"{size[0]}x{size[1]}"} if size else {}
-        values["phase_sign"] = _plain_axes(self.phase_sign)
-        values["gray_origin"] = _plain_axes(self.gray_origin_px)
+        values["phase_sign"] = _convert_axes(self.phase_sign)
+        values["gray_origin"] = _convert_axes(self.gray_origin_px)
         values["frame"] = [frame.to_dict() for frame in self.frames]
         if self.levels is not None:
             values["levels"] = list(self.levels)
         if self.phase_offset_rad != 0:
-            values["phase_offset"] = _plain_axes(self.phase_offset_rad)
+            values["phase_offset"] = _convert_axes(self.phase_offset_rad)
         if self.gray_cell_px is not None:
-            values["gray_cell_px"] = _plain_axes(self.gray_cell_px)
+            values["gray_cell_px"] = _convert_axes(self.gray_cell_px)
         if self.relative:
             values["relative"] = True
         return values
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> "PatternSequence":
-        """The sequence that `to_dict` or a `frames` TOML describes. Raises InputError."""
+        """Return the sequence that `to_dict` or a `frames` TOML describes. Raises InputError."""
         frames = data.get("frame")
         if not isinstance(frames, list) or not frames:
             raise InputError("the sequence names no frames: add a [[frame]] table for each image")
@@ -303,7 +307,7 @@ class PatternSequence:
 
 
 def parse_size(text: Any) -> tuple[int, int]:
-    """(width, height) from "912x1140" or [912, 1140]. Raises InputError."""
+    """Parse (width, height) from "912x1140" or [912, 1140]. Raises InputError."""
     parts = text.lower().split("x") if isinstance(text, str) else text
     try:
         width, height = (int(part) for part in parts)
@@ -314,20 +318,23 @@ def parse_size(text: Any) -> tuple[int, int]:
     return width, height
 
 
-def _axis_value(values: Any, axis: Axis) -> Any:
-    """The value of one axis, of a common value or a pair."""
+def _select_axis_value(values: Any, axis: Axis) -> Any:
+    """Return the value of one axis, from a common value or a pair."""
     return getattr(values, axis) if isinstance(values, PerAxis) else values
 
 
-def _plain_axes(values: Any) -> Any:
-    """A pair as a dictionary of its axes; a common value as it is."""
+def _convert_axes(values: Any) -> Any:
+    """Convert a pair to a dictionary of its axes; a common value is returned unchanged."""
     if not isinstance(values, PerAxis):
         return values
     return {axis: value for axis, value in values._asdict().items() if value is not None}
 
 
 def _read_values(data: Mapping[str, Any], name: str, default: Any, kind: type) -> Any:
-    """One value for both axes, or a `PerAxis`; an axis that is not named has the default."""
+    """Read one value for both axes, or a `PerAxis`, from ``data``; a missing axis has the default.
+
+    ``kind``: type to convert to. Raises InputError.
+    """
     given = data.get(name, default)
     if unknown := sorted(set(given) - set(get_args(Axis))) if isinstance(given, Mapping) else []:
         raise InputError(f"{name} has the unknown entry '{unknown[0]}': use x and y")
@@ -349,25 +356,25 @@ def _check_levels(levels: tuple[int, ...]) -> None:
         )
 
 
-def _check_complete(found: list[int], wanted: range, what: str) -> None:
+def _check_complete(numbers: list[int], wanted: range, what: str) -> None:
     """Raise InputError where numbers are missing or occur twice."""
-    missing = sorted(set(wanted) - set(found))
+    missing = sorted(set(wanted) - set(numbers))
     if missing:
         raise InputError(
             f"{what} {_join_numbers(missing)} of {len(wanted)} is missing: add the frame, or correct its description"
         )
-    double = [value for value, count in Counter(found).items() if count > 1]
+    double = [value for value, count in Counter(numbers).items() if count > 1]
     if double:
         raise InputError(f"{what} {_join_numbers(double)} occurs more than once: keep one frame of each")
 
 
 def _join_numbers(values: Any) -> str:
-    """Numbers as text, sorted, separated by commas."""
+    """Return numbers as text, sorted, separated by commas."""
     return ", ".join(f"{v:g}" for v in sorted(values))
 
 
 def one_axis(sequence: PatternSequence, axis: Axis) -> PatternSequence:
-    """The frames of one axis, and one texture."""
+    """Return the sequence with the frames of one axis only, and one texture frame."""
     frames = [f for f in sequence.frames if f.axis == axis]
     texture = [f for f in sequence.frames if f.kind == "texture"][:1]
     return replace(sequence, frames=(*frames, *texture))
