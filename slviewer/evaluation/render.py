@@ -46,3 +46,8 @@ def _format_cell(title: str, value: Any) -> str:
     if title.endswith("radius"):
         return f"{value:.3f}"
     return f"{value:.1f}" if title.endswith("%") else f"{value:.3f}"
+
+
+def format_count(count: int, noun: str) -> str:
+    """Format a count and its noun, in the plural unless the count is 1."""
+    return f"{count} {noun}{'' if count == 1 else 's'}"

@@ -16,7 +16,7 @@ from slviewer.report.measurements import draw_deviations
 from slviewer.report.page import Figure
 from slviewer.session.measurements import Measurement
 
-_HEADLINES = {"point": 3, "deviation": 2}
+_HEADLINES = {"point": 3}
 """How many of a measurement's quantities the list shows; 2 by default."""
 _TONES: dict[str, Tone] = {"pass": "good", "fail": "error", "undecided": "warning"}
 _COMPLETE = "±: expanded uncertainty, k = 2."

@@ -8,8 +8,6 @@ from slviewer.target.board import Board
 from slviewer.wizard.snapshot import PreviewView
 
 _DETECTED, _GHOST, _CLIPPED = (60, 220, 90), (40, 190, 255), (255, 0, 80)
-DIM = 0.35
-"""Share of the camera's range below which the brightest parts of an image are called dim."""
 
 
 def draw_preview(preview: PreviewView, board: Board | None = None, ghost_px: np.ndarray | None = None) -> np.ndarray:
@@ -34,10 +32,10 @@ def draw_preview(preview: PreviewView, board: Board | None = None, ghost_px: np.
 
 def exposure_html(preview: PreviewView) -> Html:
     """Describe whether the frame is well exposed, and what to do."""
-    if preview.saturated > 0.002:
+    if preview.brightness == "saturated":
         share = 100 * preview.saturated
         return coloured(f"{share:.1f} % saturated (red): lower the exposure", "error", bold=True)
-    if preview.brightest < DIM:
+    if preview.brightness == "dim":
         return coloured(f"Dim, peak at {100 * preview.brightest:.0f} %: raise the exposure", "warning")
     return coloured(f"Well exposed, peak at {100 * preview.brightest:.0f} %", "good")
 

@@ -12,10 +12,12 @@ import numpy as np
 import viser
 
 from slviewer.calibration.next_pose import nominal_lens
+from slviewer.evaluation.render import format_count
 from slviewer.gui.inputs import change
 from slviewer.gui.panel import PanelContext, StepPanel
 from slviewer.gui.scene import CAMERA, PROJECTOR, ViewerScene
 from slviewer.gui.widgets import Html, Text, Tone, alert, coloured, meter, paragraph, to_html
+from slviewer.session.atomic import format_bytes
 from slviewer.wizard.autopilot import Autopilot
 from slviewer.wizard.snapshot import CalibrationView, Level, Notice, PreviewView, Snapshot, StepView
 
@@ -224,7 +226,7 @@ class Shell:
             lines = [
                 f"<b>{to_html(session.folder.name)}</b>",
                 f'<span style="overflow-wrap:anywhere">{coloured(session.folder, "dim")}</span>',
-                f"{_format_count(len(session.poses), 'pose')}, {_format_count(len(session.scans), 'scan')}",
+                f"{format_count(len(session.poses), 'pose')}, {format_count(len(session.scans), 'scan')}",
             ]
             if space is not None:
                 needs = f"; a capture needs {format_bytes(space.capture_bytes)}" if space.capture_bytes else ""
@@ -294,16 +296,6 @@ def greet_viewer(client: viser.ClientHandle) -> None:
         client.gui.add_html(str(alert("View only: this link changes nothing.", "info")), order=-1.0)
 
 
-def format_bytes(n: int) -> str:
-    """Format a size with its unit: "3.4 MB"."""
-    size = float(n)
-    for unit in ("bytes", "kB", "MB", "GB"):
-        if size < 1000:
-            return f"{size:.0f} {unit}" if unit == "bytes" or size >= 100 else f"{size:.1f} {unit}"
-        size /= 1000
-    return f"{size:.1f} TB"
-
-
 def _running_work(snapshot: Snapshot) -> list[tuple[str, float]]:
     """List (description, share done) of the running capture and of the requested job."""
     job, capture, work = snapshot.job, snapshot.rig.capture, []
@@ -317,11 +309,6 @@ def _running_work(snapshot: Snapshot) -> list[tuple[str, float]]:
         waiting = f", {job.waiting} waiting" if job.waiting else ""
         work.append((f"{job.name}: {job.stage or 'starting'}{waiting} ({job.seconds:.0f} s)", job.share))
     return work
-
-
-def _format_count(n: int, noun: str) -> str:
-    """Return a count and its noun, in the plural unless `n` is 1."""
-    return f"{n} {noun}{'' if n == 1 else 's'}"
 
 
 def _notice_html(notice: Notice) -> str:

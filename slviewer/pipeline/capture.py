@@ -15,7 +15,7 @@ from slviewer.pipeline.frame_check import save_check
 from slviewer.pipeline.open_session import opened_or_made
 from slviewer.pipeline.rig_choice import RigSetup, SetUp, set_up
 from slviewer.pipeline.rig_presets import RigLike, load_rig
-from slviewer.session.atomic import format_megabytes
+from slviewer.session.atomic import format_bytes
 from slviewer.session.capture import Capture, Role
 from slviewer.session.names import safe_name
 from slviewer.session.store import Session
@@ -149,6 +149,6 @@ def _check_disk_space(store: Session, bench: RigSetup, frames: int) -> None:
     needed, free = frames * width * height * dtype.itemsize, shutil.disk_usage(store.folder).free
     if free < needed:
         raise SessionError(
-            f"the capture needs {format_megabytes(needed)} and {format_megabytes(free)} are free on {store.folder}: "
+            f"the capture needs {format_bytes(needed)} and {format_bytes(free)} are free on {store.folder}: "
             "free some space first"
         )

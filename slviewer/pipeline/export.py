@@ -16,7 +16,7 @@ from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_w
 from slviewer.pipeline.models import ModelName, check_accepted, preferred_model, warn_if_stale
 from slviewer.pipeline.open_session import SessionLike, opened
 from slviewer.pipeline.report import report
-from slviewer.session.atomic import format_megabytes
+from slviewer.session.atomic import format_bytes
 from slviewer.session.mesh_files import IN_WORDS, MESH_FORMATS, POINT_FORMATS, estimated_bytes, write_shape
 from slviewer.session.store import Session
 from slviewer.surface.meshing import MeshingPlan
@@ -60,11 +60,6 @@ class Exported:
         """Return the content, path, size and format of the file as text."""
         content = describe_format(self.path.suffix.lower().removeprefix("."))
         return f"{self.words}\n-> {self.path}, {format_bytes(self.bytes)}: {content}"
-
-
-def format_bytes(count: int) -> str:
-    """A number of bytes as text, in MB or kB."""
-    return format_megabytes(count) if count >= 100_000 else f"{count / 1e3:.1f} kB"
 
 
 def describe_format(file_format: str) -> str:

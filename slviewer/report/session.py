@@ -5,6 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from slviewer.calibration.stereo import StereoModel
+from slviewer.evaluation.render import format_count
 from slviewer.geometry.lens import Lens
 from slviewer.report.canvas import percentile
 from slviewer.report.data import CalibrationFigures, SessionData, VerificationView
@@ -41,8 +42,8 @@ def session_title(data: SessionData) -> tuple[str, str]:
     poses = sum(row.state == "used" for row in data.captures)
     scans = sum(row.role == "scan" for row in data.captures)
     return data.name, (
-        f"{_format_count(len(data.captures), 'capture')}: {_format_count(poses, 'target pose')} used to calibrate, "
-        f"{_format_count(scans, 'scan')}."
+        f"{format_count(len(data.captures), 'capture')}: {format_count(poses, 'target pose')} used to calibrate, "
+        f"{format_count(scans, 'scan')}."
     )
 
 
@@ -178,7 +179,7 @@ def _reprojection_section(calibration: CalibrationFigures) -> Section:
         else "This calibration was made elsewhere, without a reprojection error."
     ]
     if excluded:
-        text.append(f"Excluded: {_format_count(excluded, 'feature')} beyond 6 robust sigma.")
+        text.append(f"Excluded: {format_count(excluded, 'feature')} beyond 6 robust sigma.")
     return Section("Reprojection", text, items)
 
 
@@ -352,8 +353,3 @@ def _verification_table(verifications: list[VerificationView], caption: str) -> 
     if masked:
         notes.append("Masked: pixels outside the calibrated region.")
     return Table(columns, rows, caption, notes)
-
-
-def _format_count(count: int, word: str) -> str:
-    """Text of a count and its noun, in the plural unless the count is 1."""
-    return f"{count} {word}{'s' * (count != 1)}"

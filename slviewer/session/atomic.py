@@ -205,18 +205,21 @@ def _require_space(folder: Path, needs_bytes: int) -> None:
 def _disk_full_error(folder: Path, needs_bytes: int) -> SessionError:
     """Return the error for a full disk, with the needed and the free space in words."""
     free = shutil.disk_usage(folder).free
-    needs = (
-        f"needs {format_megabytes(needs_bytes)} and {format_megabytes(_SPARE_BYTES)} to spare, " if needs_bytes else ""
-    )
+    needs = f"needs {format_bytes(needs_bytes)} and {format_bytes(_SPARE_BYTES)} to spare, " if needs_bytes else ""
     return SessionError(
-        f"the disk is full: the save {needs}{format_megabytes(free)} are free on {folder}: "
+        f"the disk is full: the save {needs}{format_bytes(free)} are free on {folder}: "
         "free some space or choose another folder"
     )
 
 
-def format_megabytes(size: int) -> str:
-    """Format a size in bytes as text: `96 MB`."""
-    return f"{size / 1e6:.0f} MB" if size >= 1e7 else f"{size / 1e6:.1f} MB"
+def format_bytes(count: int) -> str:
+    """Format a number of bytes with its unit: `3.4 MB`."""
+    size = float(count)
+    for unit in ("bytes", "kB", "MB", "GB"):
+        if size < 1000:
+            return f"{size:.0f} {unit}" if unit == "bytes" or size >= 100 else f"{size:.1f} {unit}"
+        size /= 1000
+    return f"{size:.1f} TB"
 
 
 @contextmanager

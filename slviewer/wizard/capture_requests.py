@@ -11,7 +11,7 @@ from slviewer.errors import DeviceError, InputError, SessionError
 from slviewer.fringe.sequence import Axis, PatternSequence, one_axis
 from slviewer.geometry.rig import StereoRig
 from slviewer.pipeline.capture import choose_sequence, save_frames
-from slviewer.session.atomic import format_megabytes
+from slviewer.session.atomic import format_bytes
 from slviewer.wizard.acquisition import CaptureRequest
 from slviewer.wizard.engine import Engine
 from slviewer.wizard.requests import request
@@ -135,8 +135,8 @@ class CaptureRequests(ResultRequests):
         space = self._engine.space(frames)
         if space is not None and not space.enough:
             raise SessionError(
-                f"{name} needs {format_megabytes(space.capture_bytes or 0)} and "
-                f"{format_megabytes(space.free_bytes)} are free on {self._engine.store.folder}: free some space first"
+                f"{name} needs {format_bytes(space.capture_bytes or 0)} and "
+                f"{format_bytes(space.free_bytes)} are free on {self._engine.store.folder}: free some space first"
             )
 
     def _next_name(self, kind: str) -> str:

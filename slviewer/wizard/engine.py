@@ -35,11 +35,9 @@ from slviewer.wizard.preview_watcher import HandsFree, Watch, Watcher
 from slviewer.wizard.publisher import Listeners, Publisher
 from slviewer.wizard.result_views import thumbnail
 from slviewer.wizard.session_reader import SessionReader
-from slviewer.wizard.snapshot import PreviewView, RigView, SessionView, Snapshot, Space, WorldView
-from slviewer.wizard.steps import Brightness, Facts, views
+from slviewer.wizard.snapshot import Brightness, PreviewView, RigView, SessionView, Snapshot, Space, WorldView
+from slviewer.wizard.steps import Facts, views
 
-SATURATED, DIM = 0.005, 0.35
-"""Share of saturated pixels, and brightness of the brightest ones, from which on the image is reported as such."""
 READ_ATTEMPTS = 20
 """Snapshots in a row that may meet the session's files in the middle of a change."""
 
@@ -311,9 +309,7 @@ class Engine:
         self.preview = view = replace(view, countdown_s=None if now else countdown)
         if now:
             self._capture_now()
-        brightness: Brightness = "saturated" if view.saturated > SATURATED else "dim" if view.brightest < DIM else ""
-        if self.acquisition.view().light != "white":
-            brightness = ""
+        brightness = view.brightness if self.acquisition.view().light == "white" else ""
         if brightness != self._brightness:
             self._brightness = brightness
             self.publisher.mark_changed()

@@ -60,7 +60,6 @@ def nearest(points: np.ndarray, origin: np.ndarray, direction: np.ndarray) -> tu
     along = ways @ (direction / np.linalg.norm(direction))
     off = np.sqrt(np.maximum((ways**2).sum(-1) - along**2, 0))
     score = np.where((along > 0) & (off < 0.01 * along), off + 0.02 * along, np.inf)
-    score = np.where(np.isfinite(score), score, np.inf)
     index = np.unravel_index(int(np.argmin(score)), score.shape)
     return tuple(int(i) for i in index) if np.isfinite(score[index]) else None
 

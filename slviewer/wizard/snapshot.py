@@ -21,6 +21,10 @@ Level = Literal["info", "good", "warning", "error"]
 PoseState = Literal["judging", "good", "refused", "excluded", "used", "unused"]
 StepState = Literal["blocked", "ready", "done"]
 RigState = Literal["none", "opening", "open", "lost"]
+Brightness = Literal["", "saturated", "dim"]
+
+SATURATED, DIM = 0.005, 0.35
+"""Share of saturated pixels above which, and brightness of the brightest ones below which, an image is reported."""
 
 
 @dataclass(frozen=True)
@@ -391,3 +395,8 @@ class PreviewView:
     missing: str
     countdown_s: float | None
     frames_per_s: float
+
+    @property
+    def brightness(self) -> Brightness:
+        """Whether the image is saturated, dim, or neither."""
+        return "saturated" if self.saturated > SATURATED else "dim" if self.brightest < DIM else ""

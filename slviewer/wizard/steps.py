@@ -5,18 +5,17 @@ Everything here follows from the session's files and the rig.
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Literal
 
 from slviewer.calibration.soundness import MIN_POSES
+from slviewer.evaluation.render import format_count
 from slviewer.pipeline.models import POSES_FOR_PIXELWISE
-from slviewer.session.atomic import format_megabytes
-from slviewer.wizard.snapshot import CalibrationView, RigView, SessionView, Space, StepState, StepView
+from slviewer.session.atomic import format_bytes
+from slviewer.wizard.snapshot import Brightness, CalibrationView, RigView, SessionView, Space, StepState, StepView
 
 COVERED, MANY_POSES = 0.75, 15
 """Share of the coverage's goal, or number of poses, from which on the poses are enough."""
 MIN_OVERLAP = 0.3
 """Of a merged scan with its reference; below it the alignment is doubtful."""
-Brightness = Literal["", "saturated", "dim"]
 
 
 @dataclass(frozen=True)
@@ -73,11 +72,6 @@ def views(facts: Facts) -> tuple[StepView, ...]:
     return tuple(made)
 
 
-def _format_count(n: int, noun: str) -> str:
-    """Return a count and its noun, in the plural unless `n` is 1."""
-    return f"{n} {noun}{'s' * (n != 1)}"
-
-
 def _no_session(facts: Facts) -> str:
     """Return the instruction to open a session where none is open; else empty."""
     return "" if facts.session else "Open or create a session first."
@@ -95,7 +89,7 @@ def _device_problems(facts: Facts) -> Iterator[str]:
     elif facts.rig.state == "lost":
         yield f"The connection to the rig is lost: {facts.rig.fault}. Retrying every two seconds."
     if facts.space is not None and not facts.space.enough:
-        needs, free = format_megabytes(facts.space.capture_bytes or 0), format_megabytes(facts.space.free_bytes)
+        needs, free = format_bytes(facts.space.capture_bytes or 0), format_bytes(facts.space.free_bytes)
         yield f"{free} are free on the disk and a capture needs {needs}: free some space."
     if facts.brightness == "saturated":
         yield "Parts of the image are saturated: lower the exposure, or close the aperture."
@@ -213,7 +207,7 @@ def _calibrate_problems(facts: Facts) -> Iterator[str]:
         if facts.calibration.stale:
             yield f"The calibration is out of date: {facts.calibration.stale}."
         elif added := sum(pose.state == "good" for pose in facts.session.poses):
-            yield f"{_format_count(added, 'good pose')} captured after the calibration: calibrate again to use them."
+            yield f"{format_count(added, 'good pose')} captured after the calibration: calibrate again to use them."
     if MIN_POSES <= facts.good_poses < POSES_FOR_PIXELWISE:
         yield f"With fewer than {POSES_FOR_PIXELWISE} poses only the stereo model is reliable: capture more."
 
@@ -262,7 +256,7 @@ def _scan_instruction(facts: Facts) -> str:
     """Return the instruction of the step Scan."""
     if facts.scans == 0:
         return "Put the object in view, and capture it."
-    return f"{_format_count(facts.scans, 'scan')}: turn or move the object for another, or merge them next."
+    return f"{format_count(facts.scans, 'scan')}: turn or move the object for another, or merge them next."
 
 
 def _scan_problems(facts: Facts) -> Iterator[str]:
@@ -325,7 +319,7 @@ def _measure_instruction(facts: Facts) -> str:
     """Return the instruction of the step Measure."""
     if facts.session is not None and _measure_done(facts):
         n = sum(not measured.stale for measured in facts.session.measurements)
-        return f"{_format_count(n, 'measurement')}: add more, or export next."
+        return f"{format_count(n, 'measurement')}: add more, or export next."
     return "Choose a surface and a tool, then click in the 3D view; or export next."
 
 
@@ -338,7 +332,7 @@ def _measure_problems(facts: Facts) -> Iterator[str]:
 def _export_instruction(facts: Facts) -> str:
     """Return the instruction of the step Export."""
     if exports := facts.session.exports if facts.session else ():
-        return f"{_format_count(len(exports), 'file')} to download."
+        return f"{format_count(len(exports), 'file')} to download."
     return "Choose what to write: a cloud, a mesh, the calibration, the report."
 
 

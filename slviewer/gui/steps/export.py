@@ -17,8 +17,8 @@ from slviewer.pipeline.export import (
     default_file_name,
     describe_format,
     estimate_file_bytes,
-    format_bytes,
 )
+from slviewer.session.atomic import format_bytes
 from slviewer.surface.meshing import MeshingPlan, Method
 from slviewer.wizard import result_views
 from slviewer.wizard.snapshot import ExportView, SessionView, Snapshot

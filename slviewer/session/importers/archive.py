@@ -10,7 +10,7 @@ from pathlib import Path, PurePosixPath
 from typing import IO
 
 from slviewer.errors import InputError
-from slviewer.session.atomic import format_megabytes
+from slviewer.session.atomic import format_bytes
 from slviewer.session.importers.images import IMAGE_SUFFIXES
 from slviewer.session.importers.imported import listed, visible
 from slviewer.session.importers.layouts import LAYOUTS
@@ -82,8 +82,8 @@ def _select_members(zipped: zipfile.ZipFile) -> tuple[list[zipfile.ZipInfo], lis
     total = sum(info.file_size for info in members)
     if total > MOST_BYTES or len(members) > MOST_FILES:
         raise InputError(
-            f"the zip holds {len(members)} files of {format_megabytes(total)} together: {MOST_FILES} files and "
-            f"{format_megabytes(MOST_BYTES)} are allowed; import the folder by its path on the server instead"
+            f"the zip holds {len(members)} files of {format_bytes(total)} together: {MOST_FILES} files and "
+            f"{format_bytes(MOST_BYTES)} are allowed; import the folder by its path on the server instead"
         )
     if not members:
         raise InputError("the zip holds no images: put the folder of captures into a zip")
