@@ -77,8 +77,9 @@ def _describe_saturation(coded: list[int], clipped: np.ndarray) -> Contradiction
 
     ``clipped``: share of saturated pixels in each of the ``coded`` frames, among the illuminated pixels.
     """
-    k = max(range(2, len(coded) - 1), key=lambda k: float(np.median(clipped[k:]) - clipped[:k].max()))
-    if clipped[:k].max() < SUDDENLY * np.median(clipped[k:]):
+    later = range(2, len(coded) - 1)
+    k = max(later, key=lambda k: float(np.median(clipped[k:]) - clipped[:k].max()), default=0)
+    if k and clipped[:k].max() < SUDDENLY * np.median(clipped[k:]):
         text = (
             f"from frame {coded[k] + 1} on {100 * np.mean(clipped[k:]):.0f} % of the illuminated pixels are saturated, "
             "and hardly any before: the light of the room changed; keep it constant, or switch it off, and lower the "

@@ -104,10 +104,13 @@ class FrameLikeness:
 
         Blur makes finer ones one grey.
         """
-        pairs = zip(self._sequence.find("gray", axis), self._sequence.find("inverse", axis), strict=False)
-        return max(
-            (self._sequence.frames[i].bit for i, j in pairs if self._measure_difference(i, j) > ALIKE), default=-1
-        )
+        images = {
+            kind: {self._sequence.frames[i].bit: i for i in self._sequence.find(kind, axis)}
+            for kind in ("gray", "inverse")
+        }
+        bits = images["gray"].keys() & images["inverse"].keys()
+        opposed = (b for b in bits if self._measure_difference(images["gray"][b], images["inverse"][b]) > ALIKE)
+        return max(opposed, default=-1)
 
     def _measure_difference(self, i: int, j: int) -> float:
         """Return the weighted mean squared difference of two images, relative to the contrast."""

@@ -16,6 +16,8 @@ from slviewer.devices.world import SimulatedWorld, Thing
 from slviewer.fringe.decode import decode
 from slviewer.fringe.description_check import check_description
 from slviewer.fringe.frame_light import detect_light_faults, estimate_frame_light
+from slviewer.fringe.frame_likeness import FrameLikeness
+from slviewer.fringe.line_sample import sample_lines
 from slviewer.fringe.presets import AXES, bits_for, complementary, gray, gray_bits, multifrequency, p18, phase_steps
 from slviewer.fringe.sequence import Frame, PatternSequence, PerAxis
 from slviewer.simulation.rig import letter
@@ -308,3 +310,24 @@ def test_frames_of_no_pattern_that_was_described_are_unreadable() -> None:
     sequence, frames = taken("complementary")
     order = np.random.default_rng(3).permutation(len(frames))
     assert [cause for cause, _ in causes(sequence, frames[order])][-1] in ("unreadable", "frame-order")
+
+
+def test_three_frames_may_be_saturated_and_repeated() -> None:
+    sequence = PatternSequence((320, 240), tuple(phase_steps("x", 3, 360.0)))
+    angle = 2 * np.pi * np.arange(320) / 360
+    frames = np.stack([np.tile(140 + 130 * np.cos(angle - 2 * np.pi * k / 3), (240, 1)) for k in (0, 1, 1)])
+    found = check_description(sequence, np.clip(frames, 0, 255).astype(np.uint8))
+    assert found and found[0].cause in ("saturation", "frame-repeated", "step-order", "unreadable")
+
+
+def test_inverses_may_be_captured_in_another_order_than_their_bits() -> None:
+    sequence, frames = taken("inverses")
+    blurred = np.stack([cv2.GaussianBlur(frame, None, 16.0) for frame in frames])
+    last = [i for axis in AXES for i in reversed(sequence.find("inverse", axis))]
+    order = [*(i for i in range(len(frames)) if i not in last), *last]
+    turned = replace(sequence, frames=tuple(sequence.frames[i] for i in order))
+    as_captured, by_bit = (
+        FrameLikeness(each, sample_lines(each, stack))._finest
+        for each, stack in ((turned, blurred[order]), (sequence, blurred))
+    )
+    assert as_captured == by_bit and max(by_bit.values()) < 6  # the finest bits are blurred to one grey
