@@ -116,10 +116,10 @@ def test_a_save_that_the_disk_has_no_room_for_is_refused(session, sequence, fram
     big = np.zeros((4, 4000, 6000), np.uint8)
     with pytest.raises(
         SessionError,
-        match=r"needs 96 MB and .* to spare, 12 MB are free on .*: free some space or choose another folder",
+        match=r"needs 96\.0 MB and .* to spare, 12\.0 MB are free on .*: free some space or choose another folder",
     ):
         session.save_capture("b", "scan", sequence, big, source="")
-    with pytest.raises(SessionError, match=r"12 MB.*12 MB"):
+    with pytest.raises(SessionError, match=r"12\.0 MB.*12\.0 MB"):
         session.save_result("calibration/stereo", {}, {"a": np.zeros(1_500_000)})
     _check_unharmed(session, frames)
 
