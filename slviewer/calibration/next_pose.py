@@ -112,17 +112,13 @@ def depth_range(board: Board, lens: Lens) -> tuple[float, float]:
 def coverage(board: Board, lens: Lens, poses: Sequence[np.ndarray]) -> Coverage:
     """Count how often `poses`, T_camera_board (4, 4) mm each, cover the cells, depths and tilts."""
     span = depth_range(board, lens)
-    cells, depths, tilts = np.zeros((ROWS, COLUMNS), int), np.zeros(3, int), np.zeros(len(TILTS), int)
-    for T in poses:
-        covered, third, tilt = _classify(board, lens, T, span)
-        cells += covered
-        depths[third] += 1
-        tilts[tilt] += 1
-    return Coverage(cells, depths, tilts, span)
+    covered, thirds, tilts = _classify(board, lens, np.reshape(poses, (-1, 4, 4)), span)
+    depths = np.bincount(thirds, minlength=len(THIRDS))
+    return Coverage(covered.sum(axis=0), depths, np.bincount(tilts, minlength=len(TILTS)), span)
 
 
 def outline_px(board: Board, lens: Lens, T: np.ndarray) -> np.ndarray:
-    """(4, 2) px: the board's outline in the image, NaN behind the camera."""
+    """(..., 4, 2) px: the board's outline in the image at poses T (..., 4, 4), NaN behind the camera."""
     return lens.project(move_points(T, board.outline()))
 
 
@@ -141,29 +137,30 @@ def suggest(
     InputError where no pose shows the whole board.
     """
     current = coverage(board, lens, poses)
-    existing = [_describe_numerically(T, board, current.range_mm) for T in poses]
-    ranked = []
-    for T in _list_candidates(board, lens, current.range_mm, len(poses), illuminated):
-        covered, third, tilt = _classify(board, lens, T, current.range_mm)
-        gain = (
-            (covered * np.maximum(CELL_GOAL - current.cells, 0)).sum() / (CELL_GOAL * covered.size)
-            + max(GOAL_POSES - current.depths[third], 0) / GOAL_POSES
-            + max(GOAL_POSES - current.tilts[tilt], 0) / GOAL_POSES
-        )
-        descriptor = _describe_numerically(T, board, current.range_mm)
-        distance = min((float(np.linalg.norm(descriptor - other)) for other in existing), default=1.0)
-        ranked.append((gain + 0.2 * distance, T))
-    if not ranked:
+    candidates = _list_candidates(board, lens, current.range_mm, len(poses), illuminated)
+    if not len(candidates):
         raise InputError(f"the board {board} cannot be held so that the camera sees all of it: take a smaller board")
-    ranked.sort(key=lambda entry: -entry[0])
-    return describe_suggestion(board, lens, ranked[skip % len(ranked)][1])
+    covered, thirds, tilts = _classify(board, lens, candidates, current.range_mm)
+    gain = (
+        (covered * np.maximum(CELL_GOAL - current.cells, 0)).sum(axis=(1, 2)) / (CELL_GOAL * current.cells.size)
+        + np.maximum(GOAL_POSES - current.depths[thirds], 0) / GOAL_POSES
+        + np.maximum(GOAL_POSES - current.tilts[tilts], 0) / GOAL_POSES
+    )
+    distance = 1.0
+    if len(poses):
+        new, existing = (
+            _describe_numerically(np.reshape(each, (-1, 4, 4)), board, current.range_mm) for each in (candidates, poses)
+        )
+        distance = np.linalg.norm(new[:, None] - existing, axis=-1).min(axis=1)
+    order = np.argsort(-(gain + 0.2 * distance), kind="stable")
+    return describe_suggestion(board, lens, candidates[order[skip % len(order)]])
 
 
 def describe_suggestion(board: Board, lens: Lens, T_camera_board: np.ndarray) -> Suggestion:
     """Return a suggestion for a given pose, with its outline and instruction."""
     corners = outline_px(board, lens, T_camera_board)
-    _, third, tilt = _classify(board, lens, T_camera_board, depth_range(board, lens))
-    return Suggestion(T_camera_board, corners, _describe_pose(third, tilt, corners.mean(0), lens.size))
+    _, thirds, tilts = _classify(board, lens, T_camera_board[None], depth_range(board, lens))
+    return Suggestion(T_camera_board, corners, _describe_pose(thirds[0], tilts[0], corners.mean(0), lens.size))
 
 
 def projector_reach(
@@ -203,70 +200,68 @@ def _list_candidates(
     span: tuple[float, float],
     count: int,
     illuminated: Callable[[np.ndarray], np.ndarray] | None,
-) -> list[np.ndarray]:
-    """List poses (4, 4) at every depth, tilt and direction, each as far off-centre as the whole board is visible.
+) -> np.ndarray:
+    """Return poses (k, 4, 4) at every depth, tilt and direction, each as far off-centre as the whole board is visible.
 
     `span`: (near, far) mm; `count`: number of poses so far, which selects the tilt angle.
     """
     angle = np.radians((18.0, 25.0, 14.0)[count % 3])
     near, far = span
     middle = (board.points.min(0) + board.points.max(0)) / 2
-    width, height = lens.size
-    candidates = []
     # Before two poses have shown the projector's field of view, the middle of the image is most likely inside it.
-    places = list(product((-1, 0, 1), (-1, 0, 1))) if illuminated is not None else [(0, 0)]
-    for third, tilt, place in product(range(3), range(len(TILTS)), places):
-        R = _tilt_rotation(tilt, angle)
-        depth = near + (far - near) * (third + 0.5) / 3
-        offset = np.array([place[0] * width, place[1] * height]) / 2
-        for share in np.linspace(1, 0, 11) if place != (0, 0) else (0.0,):
-            u, v = np.array([(width - 1) / 2, (height - 1) / 2]) + share * offset
-            ray = np.array([(u - lens.K[0, 2]) / lens.K[0, 0], (v - lens.K[1, 2]) / lens.K[1, 1], 1.0])
-            T = rigid_transform(R, depth * ray - R @ middle)
-            if _is_visible(board, lens, T, illuminated):
-                if share > 0.15 or place == (0, 0):
-                    candidates.append(T)
-                break
-    return candidates
+    places = np.array(list(product((-1, 0, 1), repeat=2)) if illuminated is not None else [(0, 0)])
+    shares = np.linspace(1, 0, 11)  # of the way from the image's middle to its border
+    pixels = (np.array(lens.size) - 1) / 2 + shares[:, None] * (places * np.array(lens.size) / 2)[:, None]
+    rays = np.concatenate([(pixels - lens.K[:2, 2]) / np.diag(lens.K)[:2], np.ones((*pixels.shape[:2], 1))], axis=-1)
+    depths = near + (far - near) * (np.arange(3) + 0.5) / 3
+    R = np.array([_tilt_rotation(tilt, angle) for tilt in range(len(TILTS))])
+    t = depths[:, None, None, None, None] * rays - (R @ middle)[:, None, None]
+    T = rigid_transform(np.broadcast_to(R[:, None, None], (*t.shape, 3)), t)  # by depth, tilt, place and share
+    visible = _is_visible(board, lens, T.reshape(-1, 4, 4), illuminated).reshape(t.shape[:-1])
+    farthest = visible.argmax(axis=-1)
+    far_enough = (shares[farthest] > 0.15) | (places == 0).all(axis=1)
+    chosen = np.take_along_axis(T, farthest[..., None, None, None], axis=3)[..., 0, :, :]
+    return np.asarray(chosen[visible.any(axis=-1) & far_enough])
 
 
 def _is_visible(
     board: Board, lens: Lens, T: np.ndarray, illuminated: Callable[[np.ndarray], np.ndarray] | None
-) -> bool:
-    """Whether the board's outline at a pose (4, 4) is inside the image, with a margin, and illuminated."""
+) -> np.ndarray:
+    """(n,) bool: whether the board's outline at poses (n, 4, 4) is inside the image, with a margin, and illuminated."""
     corners = move_points(T, board.outline())
     pixels = lens.project(corners)
     free = _FREE * lens.size[0]
-    if not (np.isfinite(pixels).all() and (pixels > free).all() and (pixels < np.array(lens.size) - 1 - free).all()):
-        return False
-    return illuminated is None or bool(illuminated(corners).all())
+    inside = ((pixels > free) & (pixels < np.array(lens.size) - 1 - free)).all(axis=(1, 2))
+    if illuminated is not None:
+        inside[inside] = illuminated(corners[inside].reshape(-1, 3)).reshape(-1, corners.shape[1]).all(axis=1)
+    return np.asarray(inside)
 
 
-def _classify(board: Board, lens: Lens, T: np.ndarray, span: tuple[float, float]) -> tuple[np.ndarray, int, int]:
-    """Return the covered cells (3, 4) bool, the third of the depths, and the index in `TILTS` of a pose (4, 4)."""
+def _classify(
+    board: Board, lens: Lens, T: np.ndarray, span: tuple[float, float]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the covered cells (n, 3, 4) bool, third of the depths (n,), index in `TILTS` (n,) of poses (n, 4, 4)."""
     u, v = np.meshgrid(*((np.arange(n * _FINE) + 0.5) / (n * _FINE) for n in (COLUMNS, ROWS)))
     samples = np.stack([u, v], -1).reshape(-1, 2) * np.array(lens.size)
-    corners = outline_px(board, lens, T)
-    inside = np.zeros(len(samples), bool)
-    if np.isfinite(corners).all():
-        sides = np.roll(corners, -1, 0) - corners
-        away = samples[:, None] - corners
-        turns = sides[:, 0] * away[..., 1] - sides[:, 1] * away[..., 0]
-        inside = (turns > 0).all(1) | (turns < 0).all(1)
-    cells = inside.reshape(ROWS, _FINE, COLUMNS, _FINE).mean((1, 3)) >= _CELL_SHARE
+    corners = outline_px(board, lens, T)[:, None]
+    sides = np.roll(corners, -1, -2) - corners
+    away = samples[:, None] - corners
+    turns = sides[..., 0] * away[..., 1] - sides[..., 1] * away[..., 0]
+    inside = (turns > 0).all(-1) | (turns < 0).all(-1)  # not for corners of NaN
+    cells = inside.reshape(-1, ROWS, _FINE, COLUMNS, _FINE).mean((2, 4)) >= _CELL_SHARE
     near, far = span
-    third = int(np.clip(3 * (_board_middle(T, board)[2] - near) / (far - near), 0, 2))
-    return cells, third, _classify_tilt(T)
+    thirds = np.clip(3 * (_board_middle(T, board)[:, 2] - near) / (far - near), 0, 2).astype(int)
+    return cells, thirds, _classify_tilt(T)
 
 
-def _classify_tilt(T: np.ndarray) -> int:
-    """Return the index in `TILTS` of a pose (4, 4)."""
-    normal = T[:3, 2] * (1 if T[2, 2] >= 0 else -1)
-    if np.degrees(np.arccos(np.clip(normal[2], -1, 1))) < FACING_DEG:
-        return 0
+def _classify_tilt(T: np.ndarray) -> np.ndarray:
+    """Return the index in `TILTS` of poses (n, 4, 4)."""
+    normal = T[:, :3, 2] * np.where(T[:, 2, 2] >= 0, 1, -1)[:, None]
     # the side towards which depth grows: dz/dx = -n_x/n_z, dz/dy = -n_y/n_z, and up in the image is -y
-    right, top = -normal[0], normal[1]
-    return (1 if top > 0 else 3) if abs(top) >= abs(right) else (2 if right > 0 else 4)
+    right, top = -normal[:, 0], normal[:, 1]
+    tilted = np.where(np.abs(top) >= np.abs(right), np.where(top > 0, 1, 3), np.where(right > 0, 2, 4))
+    facing = np.degrees(np.arccos(np.clip(normal[:, 2], -1, 1))) < FACING_DEG
+    return np.where(facing, 0, tilted)
 
 
 def _tilt_rotation(tilt: int, angle: float) -> np.ndarray:
@@ -276,15 +271,16 @@ def _tilt_rotation(tilt: int, angle: float) -> np.ndarray:
 
 
 def _describe_numerically(T: np.ndarray, board: Board, span: tuple[float, float]) -> np.ndarray:
-    """Return a descriptor (5,) of a pose for distances between poses: position, depth and tilt in units of about 1."""
-    x, y, z = _board_middle(T, board)
+    """Return descriptors (n, 5) of poses (n, 4, 4), to compare them: position, depth and tilt in units of about 1."""
+    middle = _board_middle(T, board)
     reach = np.ptp(board.points[:, 0]) / 2
-    return np.array([x / reach, y / reach, (z - span[0]) / (span[1] - span[0]), *(T[:2, 2] / np.sin(np.radians(25)))])
+    depth = (middle[:, 2:] - span[0]) / (span[1] - span[0])
+    return np.hstack([middle[:, :2] / reach, depth, T[:, :2, 2] / np.sin(np.radians(25))])
 
 
 def _board_middle(T: np.ndarray, board: Board) -> np.ndarray:
-    """Return the middle (3,) mm of the board's features at a pose (4, 4), in the camera's frame."""
-    return move_points(T, ((board.points.min(0) + board.points.max(0)) / 2)[None])[0]
+    """Return the middle (n, 3) mm of the board's features at poses (n, 4, 4), in the camera's frame."""
+    return move_points(T, ((board.points.min(0) + board.points.max(0)) / 2)[None])[:, 0]
 
 
 def _describe_pose(third: int, tilt: int, middle_px: np.ndarray, size: tuple[int, int]) -> str:

@@ -132,14 +132,14 @@ def plan(given: PlanInput) -> PosePlan:
         if rough is None:
             return _plan_by_coverage(given, given.initial_lens(), {})
         rig, known = rough[0], dict(zip(given.features, rough[1], strict=True))
-    spread = _plan_by_coverage(given, rig.camera, known)
+    spread = _plan_by_coverage(given, rig.camera, known, suggests=False)
     expected = ExpectedNoise().with_noise(np.array([f.noise_px for f in poses]) / given.projector[0])
     try:
         guidance = suggest_poses(GuidanceModel(rig, given.board, expected), list(spread.poses.values()))
     except (InputError, np.linalg.LinAlgError):  # devices that share no view: better coverage may repair it
-        return spread
+        guidance = None
     if guidance is None:
-        return spread
+        return _plan_by_coverage(given, rig.camera, known)
     T = guidance.poses[given.refused % len(guidance.poses)]
     return replace(
         spread,
@@ -161,22 +161,26 @@ def quick_plan(given: PlanInput, before: PosePlan | None) -> PosePlan:
     return _plan_by_coverage(given, given.initial_lens(), {})
 
 
-def _plan_by_coverage(given: PlanInput, lens: Lens, known: Mapping[str, np.ndarray]) -> PosePlan:
-    """Plan the next pose by coverage; poses (4, 4) that are not `known` are estimated with the lens."""
+def _plan_by_coverage(given: PlanInput, lens: Lens, known: Mapping[str, np.ndarray], suggests: bool = True) -> PosePlan:
+    """Plan the next pose by coverage, with a suggestion if ``suggests``; poses (4, 4) that are not ``known`` are
+    estimated with the lens."""
     poses = {}
     for name, one in given.features.items():
         T = known[name] if name in known else approximate_pose(one.points, one.camera, lens)
         if T is not None:
             poses[name] = T
+    placed = list(poses.values())
+    usual_mm = USUAL_SIGMA * float(np.mean(depth_range(given.board, lens)))
+    by_coverage = PosePlan(lens, poses, coverage(given.board, lens, placed), None, usual_mm)
+    if not suggests:
+        return by_coverage
     reached = None
     if poses:
         points = np.concatenate([given.features[n].points @ T[:3, :3].T + T[:3, 3] for n, T in poses.items()])
         projected = np.concatenate([given.features[n].projector for n in poses])
         reached = projector_reach(points, projected, given.projector)
-    placed = list(poses.values())
     try:
         suggestion = suggest(given.board, lens, placed, illuminated=reached, skip=given.refused)
     except InputError:  # nothing fits into the view
-        suggestion = None
-    usual_mm = USUAL_SIGMA * float(np.mean(depth_range(given.board, lens)))
-    return PosePlan(lens, poses, coverage(given.board, lens, placed), suggestion, usual_mm)
+        return by_coverage
+    return replace(by_coverage, suggestion=suggestion)

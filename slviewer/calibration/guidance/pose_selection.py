@@ -55,7 +55,7 @@ def suggest_poses(model: GuidanceModel, poses: Sequence[Floats]) -> Guidance | N
 
     gains = compute_gains(np.random.default_rng(len(poses)).permutation(len(candidates))[:TRIALS].tolist())
     best = max(gains, key=lambda i: gains[i])
-    nearest = np.argsort([_pose_distance(candidates[best], T) for T in candidates])[: TRIALS // 5]
+    nearest = np.argsort(_pose_distances(candidates[best], candidates))[: TRIALS // 5]
     gains |= compute_gains([i for i in nearest.tolist() if i not in gains])
     order = sorted(gains, key=lambda i: -gains[i])
     next_variance = max(float(information.variances.mean()) - gains[order[0]], 0.0)
@@ -101,7 +101,7 @@ def _select_extremes(places: Floats) -> list[int]:
     )
 
 
-def _pose_distance(T: Floats, other: Floats) -> float:
-    """Return a distance of two poses (4, 4): translation over a tenth of the depth, plus rotation over 15 degrees."""
-    translation = float(np.linalg.norm(T[:3, 3] - other[:3, 3])) / (0.1 * T[2, 3])
-    return translation + float(rotation_angle(T[:3, :3].T @ other[:3, :3])) / np.radians(15)
+def _pose_distances(T: Floats, others: Floats) -> Floats:
+    """Return distances (n,) of a pose (4, 4) to others (n, 4, 4): shift over 0.1 depth, plus turn over 15 degrees."""
+    translations = np.linalg.norm(T[:3, 3] - others[:, :3, 3], axis=1) / (0.1 * T[2, 3])
+    return np.asarray(translations + rotation_angle(T[:3, :3].T @ others[:, :3, :3]) / np.radians(15))
