@@ -30,6 +30,10 @@ SEARCH_PX = 800
 BINS = 64
 STILL_PX = 0.004
 """A board whose features move less than this share of the image's width between two looks is held still."""
+_UNCHANGED = (
+    6.0  # 99 % of a thumbnail's grey levels differ by less where nothing moved: a board's edges, by a fifth of a px
+)
+_THUMBNAIL_PX = 160
 _REST = 2.0  # pause after a detection, as a multiple of its duration: a third of one core at most
 
 
@@ -91,6 +95,8 @@ class Watcher:
         self._watch = Watch()
         self._result: tuple[Watch, BoardSeen | None, str] = (self._watch, None, "")
         self._stillness = Stillness()
+        self._searched: tuple[Board | None, np.ndarray] | None = None  # the board, and a thumbnail of the last image
+        self._detected: tuple[Detection | None, str] = (None, "")
         self._number, self._rate, self._last = 0, 0.0, 0.0
         self._detector = LatestWorker("slviewer board detection", self._detect, _REST)
         self._viewer = LatestWorker("slviewer preview", self._make_preview)
@@ -125,10 +131,16 @@ class Watcher:
         self._analysed(PreviewView(self._number, image, scale, *brightness(frame), board, missing, None, rate))
 
     def _detect(self, item: tuple[np.ndarray, float, float]) -> None:
-        """Detect the board in (reduced image, its scale, time in s), and store it, or why there is none."""
+        """Detect the board in (reduced image, its scale, time in s), and store it, or why there is none.
+
+        An image in which nothing has moved is not searched again.
+        """
         image, scale, time_s = item
         watch, board = self._watch, None
-        detection, missing = detect_board(watch.board, image)
+        thumbnail = reduced(image, _THUMBNAIL_PX)[0]
+        if self._searched is None or self._searched[0] != watch.board or _differs(thumbnail, self._searched[1]):
+            self._searched, self._detected = (watch.board, thumbnail), detect_board(watch.board, image)
+        detection, missing = self._detected
         if detection is not None and watch.board is not None:
             # centres of reduced pixels to those of the camera's
             detection = replace(detection, pixels=(detection.pixels + 0.5) / scale - 0.5)
@@ -158,19 +170,26 @@ class Stillness:
         self._pixels = None
 
 
-def reduced(frame: np.ndarray) -> tuple[np.ndarray, float]:
-    """Reduce a frame (h, w) to uint8 with at most SEARCH_PX on its longer side; returns (image, scale)."""
-    scale = min(1.0, SEARCH_PX / max(frame.shape))
+def reduced(frame: np.ndarray, longest_px: int = SEARCH_PX) -> tuple[np.ndarray, float]:
+    """Reduce a frame (h, w) to uint8 with at most ``longest_px`` on its longer side; returns (image, scale)."""
+    scale = min(1.0, longest_px / max(frame.shape))
     small = cv2.resize(frame, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else frame
     return to_eight_bits(small, int(frame.max(initial=0))), scale
+
+
+def _differs(image: np.ndarray, before: np.ndarray) -> bool:
+    """Whether anything has moved between two thumbnails (h, w) uint8."""
+    return image.shape != before.shape or float(np.percentile(cv2.absdiff(image, before), 99)) >= _UNCHANGED
 
 
 def brightness(frame: np.ndarray) -> tuple[float, float, np.ndarray]:
     """Return (share of saturated pixels, 99.5th percentile as a share of the range, histogram (64,) of shares)."""
     top = clip_level(frame.dtype, int(frame.max(initial=0)))
     some = frame[:: max(1, frame.shape[0] // 400), :: max(1, frame.shape[1] // 400)]
-    counts = np.histogram(some, BINS, (0, top + 1))[0]
-    return float((some >= top).mean()), float(np.percentile(some, 99.5)) / top, counts / some.size
+    by_level = np.bincount(some.ravel(), minlength=int(top) + 1)
+    brightest = int(np.searchsorted(by_level.cumsum(), 0.995 * some.size))
+    shares = np.histogram(np.arange(len(by_level)), BINS, (0, top + 1), weights=by_level / some.size)[0]
+    return float(by_level[int(top) :].sum()) / some.size, brightest / top, shares
 
 
 def detect_board(board: Board | None, image: np.ndarray) -> tuple[Detection | None, str]:

@@ -13,6 +13,7 @@ from slviewer.simulation.boards import Pose, printed_board
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import letter
 from slviewer.target.board import Board
+from slviewer.wizard import preview_watcher
 from slviewer.wizard.preview_watcher import HandsFree, Stillness, Watch, Watcher, brightness, reduced
 from slviewer.wizard.snapshot import BoardSeen, PreviewView
 
@@ -53,6 +54,30 @@ def test_the_board_is_found_in_the_cameras_pixels() -> None:
     assert board.T_camera_board is not None
     np.testing.assert_allclose(board.T_camera_board[:3, 3], scene.pose.t, atol=6)
     assert found[0].image.shape[1] == 800 and 0.7 < found[0].brightest < 0.95 and found[0].saturated == 0
+
+
+def test_an_image_is_searched_again_only_once_something_has_moved(monkeypatch: pytest.MonkeyPatch) -> None:
+    searched: list[np.ndarray] = []
+
+    def detect_nothing(board: Board | None, image: np.ndarray) -> tuple[None, str]:
+        searched.append(image)
+        return None, "no board"
+
+    monkeypatch.setattr(preview_watcher, "detect_board", detect_nothing)
+    rig = letter(0.25, local_distortion_px=0)
+    white = PatternSequence(rig.projector.size, (Frame("white"),))
+    watcher = Watcher(lambda view: None)
+    watcher.watch(Watch(BOARD))
+    try:
+        for shift_mm, seed, count in ((0, 0, 1), (0, 1, 1), (0.5, 2, 2), (0.5, 3, 2)):  # 0.7 px
+            scene = printed_board(BOARD, Pose(np.eye(3), np.array([shift_mm - 80, -60, 620.0])))
+            watcher._detect((Renderer(rig, scene).capture(white, seed)[0], 1.0, 0.0))
+            assert len(searched) == count
+        watcher.watch(Watch(Board.parse("circles:7x5:20")))
+        watcher._detect((searched[-1], 1.0, 0.0))
+        assert len(searched) == 3
+    finally:
+        watcher.close()
 
 
 def test_only_the_latest_frame_is_looked_at() -> None:
