@@ -89,7 +89,7 @@ def capture(
             store, name, role, sequence, captured, source=devices.name, purpose=purpose, board=shown, force=force
         )
         try:
-            for sentence in save_check(store, name).warnings():
+            for sentence in save_check(store, saved).warnings():
                 warn(f"{name}: {sentence}")
         except SlviewerError as error:  # it is saved, and can be looked at later
             warn(f"{name} is saved, and its frames could not be checked: {error}")

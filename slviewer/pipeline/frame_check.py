@@ -12,6 +12,7 @@ from slviewer.fringe.residual import FrameResidual, FrameResiduals, capture_resi
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.fringe.suspect import Suspect
 from slviewer.records import from_plain, to_plain
+from slviewer.session.capture import Capture
 from slviewer.session.store import Session
 
 VERSION = 2
@@ -72,13 +73,17 @@ def check_frames(sequence: PatternSequence, stack: np.ndarray) -> FrameCheck:
     return FrameCheck(tuple(capture_residuals(sequence, stack)), check_description(sequence, stack))
 
 
-def save_check(session: Session, name: str) -> FrameCheck:
-    """Check a capture's frames and save the result."""
-    capture = session.load_capture(name)
-    check = check_frames(capture.sequence, capture.frames)
-    meta = {"inputs": session.input_hashes(name), "version": VERSION, **check.to_json()}
-    session.save_result(f"trust/{name}", meta, {})
+def save_check(session: Session, capture: Capture, frames: np.ndarray | None = None) -> FrameCheck:
+    """Check a capture's ``frames`` (n, h, w), read here if None, and save the result."""
+    check = check_frames(capture.sequence, capture.frames if frames is None else frames)
+    meta = {"inputs": {capture.name: capture.hash}, "version": VERSION, **check.to_json()}
+    session.save_result(f"trust/{capture.name}", meta, {})
     return check
+
+
+def load_or_save_check(session: Session, capture: Capture, frames: np.ndarray | None = None) -> FrameCheck:
+    """The saved check of a capture, else a new one as ``save_check`` makes it."""
+    return load_check(session, capture.name) or save_check(session, capture, frames)
 
 
 def load_check(session: Session, name: str) -> FrameCheck | None:

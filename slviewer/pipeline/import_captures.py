@@ -208,7 +208,7 @@ def _save_captures(
             warn(f"not imported: {each}")
         for capture in saved:
             progress(1.0, f"looking at {capture.name}")
-            for sentence in save_check(store, capture.name).warnings():
+            for sentence in save_check(store, capture).warnings():
                 warn(f"{capture.name}: {sentence}")
     progress(1.0, "imported")
     return [capture.name for capture in saved]

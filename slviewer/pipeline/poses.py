@@ -1,7 +1,8 @@
 """The observation of each target pose, computed once and stored in the session with its frames."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from slviewer.errors import InputError
 from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.pipeline.capture_phases import capture_texture, check_capture, decode_captures
-from slviewer.pipeline.frame_check import FrameCheck, check_frames, load_check
+from slviewer.pipeline.frame_check import FrameCheck, check_frames, load_or_save_check
 from slviewer.pipeline.pose_evidence import gather_evidence as examine_frames
 from slviewer.pipeline.pose_evidence import load_evidence, save_evidence
 from slviewer.session.capture import Capture
@@ -39,28 +40,34 @@ def read_pose(
     board: Board,
     smoothing: Smoothing,
     examine: bool = False,
-    check: FrameCheck | None = None,
+    check: Callable[[], FrameCheck] | None = None,
+    observed: Callable[[Observation], None] = lambda observation: None,
 ) -> Judged:
     """Return the observation of a decoded target pose, or the reason why there is none.
 
-    ``texture`` (h, w) or (h, w, 3) uint8 shows the board. ``examine``: with the evidence of its frames (n, h, w).
-    ``check``: of its frames; computed if None.
+    ``texture`` (h, w) or (h, w, 3) uint8 shows the board. ``examine``: with the evidence of its frames (n, h, w), of
+    which ``check`` returns the check (computed if None). ``observed`` is called with the observation before the frames
+    are checked, after which the pose may still be refused.
     """
     detection: Detection | None = None
     observation: Observation | None = None
     refused = ""
-    if examine:
-        check = check or check_frames(sequence, frames)
     try:
         detection = detect(board, texture)
         observation = observe(name, board, detection, phases, smoothing)
-        check_capture(name, sequence, frames, phases, check)
+        observed(observation)
     except InputError as error:
         refused = str(error).removeprefix(f"{name}: ")
+    checked = (check or partial(check_frames, sequence, frames))() if examine else None
+    if observation is not None:
+        try:
+            check_capture(name, sequence, frames, phases, checked)
+        except InputError as error:
+            refused = str(error).removeprefix(f"{name}: ")
     evidence = None
-    if examine and check:
+    if checked is not None:
         evidence = examine_frames(
-            name, sequence, frames, phases, board, texture, check, detection, observation, refused
+            name, sequence, frames, phases, board, texture, checked, detection, observation, refused
         )
     return Judged(name, None if refused else observation, refused, evidence)
 
@@ -73,11 +80,14 @@ def read_stored_pose(
     board: Board,
     smoothing: Smoothing,
     examine: bool = False,
+    observed: Callable[[Observation], None] = lambda observation: None,
 ) -> Judged:
-    """Read the pose as ``read_pose`` does, and save the result in the session."""
+    """Read the pose as ``read_pose`` does, and save the result and the check of the frames in the session."""
     texture = capture_texture(capture, frames)
-    check = load_check(store, capture.name)
-    judged = read_pose(capture.name, capture.sequence, frames, phases, texture, board, smoothing, examine, check)
+    check = partial(load_or_save_check, store, capture, frames)
+    judged = read_pose(
+        capture.name, capture.sequence, frames, phases, texture, board, smoothing, examine, check, observed
+    )
     if judged.evidence is not None:
         save_evidence(store, capture, board, judged.evidence)
     meta = {
@@ -110,12 +120,17 @@ def load_judged(store: Session, name: str, board: Board, smoothing: Smoothing) -
 
 
 def read_stored_poses(
-    store: Session, names: Sequence[str], board: Board, smoothing: Smoothing, examine: bool = False
+    store: Session,
+    names: Sequence[str],
+    board: Board,
+    smoothing: Smoothing,
+    examine: bool = False,
+    observed: Callable[[Observation], None] = lambda observation: None,
 ) -> Iterator[Judged]:
     """Yield every pose in order; frames are read only where no stored result is valid.
 
-    ``examine``: each with the evidence of its frames. Raises InputError where poses come from cameras or projectors of
-    different size.
+    ``examine``: each with the evidence of its frames; ``observed`` as in ``read_pose``. Raises InputError
+    where poses come from cameras or projectors of different size.
     """
     captures = [store.load_capture(name) for name in names]
     for capture in captures[1:]:
@@ -133,7 +148,7 @@ def read_stored_poses(
             cached[name] = replace(judged, evidence=evidence) if judged and evidence else None
     decoded = decode_captures(store, [name for name in names if cached[name] is None])
     for name in names:
-        yield cached[name] or read_stored_pose(store, *next(decoded), board, smoothing, examine)
+        yield cached[name] or read_stored_pose(store, *next(decoded), board, smoothing, examine, observed)
 
 
 def load_observations(store: Session, names: Sequence[str]) -> list[Observation]:

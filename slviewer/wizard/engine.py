@@ -13,12 +13,12 @@ from pathlib import Path
 
 import numpy as np
 
-from slviewer.calibration.observe import Smoothing
+from slviewer.calibration.observe import Observation, Smoothing
 from slviewer.devices.protocols import CameraSettings
 from slviewer.devices.world import SimulatedWorld
 from slviewer.errors import InputError, SessionError, SlviewerError
 from slviewer.pipeline.check_results import Preflight
-from slviewer.pipeline.frame_check import load_check, save_check
+from slviewer.pipeline.frame_check import load_check, load_or_save_check
 from slviewer.pipeline.poses import read_stored_poses
 from slviewer.pipeline.rig_choice import Choice, RigSetup, SetUp, needs_page
 from slviewer.pipeline.rig_presets import save_rig
@@ -281,17 +281,31 @@ class Engine:
         if not reader.has_thumbnail(capture):
             reader.add_thumbnail(capture, thumbnail(capture))
             self.publisher.mark_changed(session=True)
-        target = reader.target()
         session = reader.session.guarded(report.saving)
         report(0.0, f"reading {capture.name}")
-        if load_check(session, capture.name) is None:
-            for sentence in save_check(session, capture.name).warnings():
-                self.notices.add("warning", f"{capture.name}: {sentence}")
-        if reader.needs_judging(capture, target):
-            judged = next(read_stored_poses(session, [capture.name], Board.parse(target), Smoothing(), examine=True))
-            if judged.observation is None:
-                self.notices.add("warning", f"{capture.name} cannot be used: {judged.refused}")
+        is_new = load_check(session, capture.name) is None
+        try:
+            if reader.needs_judging(capture, reader.target()):
+                self._judge_pose(reader, session, capture)
+        finally:
+            if is_new:
+                for sentence in load_or_save_check(session, capture).warnings():
+                    self.notices.add("warning", f"{capture.name}: {sentence}")
+
+    def _judge_pose(self, reader: SessionReader, session: Session, capture: Capture) -> None:
+        """Read the features of a target pose, examine its frames, and save both; the next pose is planned meanwhile."""
+        target = reader.target()
+
+        def plan_next(observation: Observation) -> None:
+            """Let the next pose be planned from the features, before the frames are examined."""
+            reader.add_features(capture, target, observation)
             self.publisher.mark_changed(session=True)
+
+        poses = read_stored_poses(session, [capture.name], Board.parse(target), Smoothing(), True, plan_next)
+        judged = next(poses)
+        if judged.observation is None:
+            self.notices.add("warning", f"{capture.name} cannot be used: {judged.refused}")
+        self.publisher.mark_changed(session=True)
 
     def _handle_processing_failure(self, reader: SessionReader, capture: Capture, error: BaseException) -> None:
         """Report that a capture could not be processed, and store why it is unreadable."""

@@ -9,6 +9,7 @@ import numpy as np
 
 from slviewer.calibration.diagnosis.verdict import Verdict
 from slviewer.calibration.next_pose import outline_px
+from slviewer.calibration.observe import Observation
 from slviewer.calibration.pixelwise import PixelwiseModel
 from slviewer.calibration.splined.model import SplinedModel
 from slviewer.calibration.stereo import StereoModel
@@ -86,11 +87,20 @@ class SessionReader:
         self._lock = threading.Lock()
         self._thumbnails: dict[str, bytes] = {}
         self._unreadable: dict[tuple[str, str], str] = {}
+        self._features: dict[tuple[str, str], PoseFeatures] = {}  # of poses that are not judged yet
 
     def add_thumbnail(self, capture: Capture, jpeg: bytes) -> None:
         """Store the thumbnail of a capture."""
         with self._lock:
             self._thumbnails[capture.hash] = jpeg
+
+    def add_features(self, capture: Capture, target: str, observation: Observation) -> None:
+        """Store the features of a pose whose frames are still being examined, for the plan of the next pose."""
+        sigma = observation.samples.sigma if observation.samples else np.zeros(0)
+        with self._lock:
+            self._features[capture.hash, target] = _make_features(
+                observation.points, observation.camera, observation.projector, sigma
+            )
 
     def add_unreadable(self, capture: Capture, why: str) -> None:
         """Store why a pose cannot be evaluated, so that it is not tried again."""
@@ -209,11 +219,15 @@ class SessionReader:
         plan = given = None
         is_final = True
         if target and camera is not None and projector is not None:
-            features = {
-                name: self._load_features(name, meta["hash"])
-                for name, meta in judged.items()
-                if meta is not None and not meta["refused"] and states[name][0] not in ("excluded", "refused")
-            }
+            features = {}
+            for pose in poses:
+                meta, early = judged[pose.name], self._features.get((pose.hash, target))
+                if states[pose.name][0] in ("excluded", "refused"):
+                    continue
+                if meta is not None:
+                    features[pose.name] = self._load_features(pose.name, meta["hash"])
+                elif early is not None:
+                    features[pose.name] = early
             stereo = None if calibration is None or calibration.refused else calibration.stereo
             hashes = [(name, captures[name].hash) for name in features]
             if stereo is not None:
@@ -274,9 +288,9 @@ class SessionReader:
                 arrays = self.session.load_result(f"poses/{name}", only=(*names, "samples_sigma"))[1]
             except InputError:  # saved before samples were
                 arrays = self.session.load_result(f"poses/{name}", only=names)[1]
-            sigma = arrays.pop("samples_sigma", np.zeros(0))
-            known = sigma[np.isfinite(sigma)]
-            return PoseFeatures(**arrays, noise_px=float(np.median(known)) if known.size else np.nan)
+            return _make_features(
+                **{each: arrays[each] for each in names}, sigma=arrays.get("samples_sigma", np.zeros(0))
+            )
 
         return self._get_cached(("features", content_hash), load)  # type: ignore[no-any-return]
 
@@ -402,6 +416,12 @@ class SessionReader:
                 self._cache.clear()
             self._cache[key] = make()
         return self._cache[key]
+
+
+def _make_features(points: np.ndarray, camera: np.ndarray, projector: np.ndarray, sigma: np.ndarray) -> PoseFeatures:
+    """Return features (n, 3) mm, (n, 2) and (n, 2) px, with the median of their samples' standard deviations, px."""
+    known = sigma[np.isfinite(sigma)]
+    return PoseFeatures(points, camera, projector, float(np.median(known)) if known.size else np.nan)
 
 
 def _has_changed(used: Mapping[str, object], now: Mapping[str, object]) -> bool:

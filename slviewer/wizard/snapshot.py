@@ -292,8 +292,9 @@ class SessionView:
 
     @property
     def enough(self) -> bool:
-        """Whether the poses reach the wanted accuracy."""
-        return self.plan is not None and self.plan.reaches(self.wanted_mm)
+        """Whether the poses, all of which are judged, reach the wanted accuracy."""
+        is_judged = all(pose.state != "judging" for pose in self.poses)
+        return is_judged and self.plan is not None and self.plan.reaches(self.wanted_mm)
 
     @property
     def coverage(self) -> Coverage | None:

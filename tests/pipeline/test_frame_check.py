@@ -71,7 +71,7 @@ def test_a_saved_check_is_read_until_the_checks_change(tmp_path, monkeypatch):
     with Session.create(tmp_path / "session") as session:
         session.save_capture("part", "scan", sequence, stack, source="a test")
         assert load_check(session, "part") is None
-        saved = save_check(session, "part")
+        saved = save_check(session, session.load_capture("part"))
         assert saved.warnings() and load_check(session, "part").warnings() == saved.warnings()
         monkeypatch.setattr(frame_check, "VERSION", frame_check.VERSION + 1)
         assert load_check(session, "part") is None
