@@ -4,19 +4,23 @@ Results go to standard output, progress and warnings to standard error. Exit sta
 3 calibration rejected, 130 cancelled. Nothing heavy is imported before a command needs it.
 """
 
+import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import tyro
 
+# Several threads multiply small matrices; OpenBLAS would wake threads of its own for each, which then wait for work.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy is imported
+
 from slviewer import __version__, terminal
 from slviewer.commands.calibration import CALIBRATED, run_calibrate
 from slviewer.commands.command import JSON, read_command, show_result, union
 from slviewer.commands.devices import CHECKED, PORT, run_capture, run_preflight
-from slviewer.commands.imports import import_command
+from slviewer.commands.imports import make_import_command
 from slviewer.commands.meshing import MESHING, run_meshing
 from slviewer.commands.wizard import wizard
 from slviewer.errors import Cancelled, SlviewerError
@@ -36,58 +40,95 @@ def describe_simulation(names: list[str], session: Path, **_: Any) -> str:
     return f"{len(names)} captures simulated into {session}; next: slviewer calibrate {session} --target {TARGET}"
 
 
-COMMANDS: dict[str, Callable[..., Any]] = {
-    "wizard": wizard,
-    "devices": read_command("pipeline.devices:devices"),
-    "preflight": read_command("preflight.check_rig:check_rig", options=CHECKED, run=run_preflight),
-    "capture": read_command("pipeline.capture:capture", "session", "name", options=[PORT], run=run_capture),
-    "import": import_command,
-    "calibrate": read_command("pipeline.calibrate:calibrate", "session", options=CALIBRATED, run=run_calibrate),
-    "validate": read_command("pipeline.validate:validate", "session", options=[JSON]),
-    "decode": read_command("pipeline.decode:decode", "session", "capture", names={"file_format": "format"}),
-    "reconstruct": read_command("pipeline.reconstruct:reconstruct", "session", "capture"),
-    "verify": read_command(
-        "pipeline.verify:verify",
-        "session",
-        "captures",
-        options=[JSON],
-        names={"models": "model", "depth_range": "range"},
-    ),
-    "merge": read_command("pipeline.merge:merge", "session", "captures", options=[JSON]),
-    "mesh": read_command("pipeline.mesh:mesh", "session", "names", options=[*MESHING, JSON], run=run_meshing),
-    "compare": read_command("pipeline.compare:compare", "session", "scan", "nominal", options=[JSON]),
-    "measure": read_command(
-        "pipeline.measure:measure",
-        "session",
-        "scan",
-        "what",
-        run=partial(show_result, describe=describe_measurement),
-    ),
-    "measurements": read_command("pipeline.measure:edit_measurements", "session"),
-    "export": read_command(
-        "pipeline.export:export",
-        "session",
-        "what",
-        "name",
-        options=MESHING,
-        names={"file_format": "format"},
-        run=run_meshing,
-    ),
-    "batch": read_command("pipeline.batch:batch", "sessions", options=[JSON]),
-    "check": read_command("pipeline.check:check", "session", "capture", options=[JSON]),
-    "accept": read_command("pipeline.accept:accept", "session", options=[JSON]),
-    "simulate": read_command(
-        "pipeline.simulate:simulate", "session", run=partial(show_result, describe=describe_simulation)
-    ),
-    "reproduce": read_command("validation.reproduce:reproduce", options=[JSON]),
-    "prove": read_command("validation.prove:prove", options=[JSON], names={"cases": "case"}),
-    "patterns": read_command("pipeline.printouts:patterns"),
-    "target": read_command("pipeline.printouts:target", "board"),
-    "detect": read_command("pipeline.detect:detect_board", "images", options=[JSON], names={"csv_out": "csv"}),
-    "report": read_command("pipeline.report:report", "session"),
-    "inspect": read_command("pipeline.inspect:inspect", "session"),
-    "bench": read_command("validation.bench:bench", options=[JSON]),
-}
+DESCRIPTION = "Structured-light 3D scanning: calibrate a camera and a projector, prove it, scan, merge."
+
+
+class Commands(Mapping[str, Callable[..., Any]]):
+    """Commands by name, each made when it is first used: that reads the source of its function."""
+
+    def __init__(self, make: Mapping[str, Callable[[], Callable[..., Any]]]) -> None:
+        self._make = make
+
+    def __getitem__(self, name: str) -> Callable[..., Any]:
+        return self._make[name]()
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._make)
+
+    def __len__(self) -> int:
+        return len(self._make)
+
+
+COMMANDS = Commands(
+    {
+        "wizard": lambda: wizard,
+        "devices": partial(read_command, "pipeline.devices:devices"),
+        "preflight": partial(read_command, "preflight.check_rig:check_rig", options=CHECKED, run=run_preflight),
+        "capture": partial(
+            read_command, "pipeline.capture:capture", "session", "name", options=[PORT], run=run_capture
+        ),
+        "import": make_import_command,
+        "calibrate": partial(
+            read_command, "pipeline.calibrate:calibrate", "session", options=CALIBRATED, run=run_calibrate
+        ),
+        "validate": partial(read_command, "pipeline.validate:validate", "session", options=[JSON]),
+        "decode": partial(
+            read_command, "pipeline.decode:decode", "session", "capture", names={"file_format": "format"}
+        ),
+        "reconstruct": partial(read_command, "pipeline.reconstruct:reconstruct", "session", "capture"),
+        "verify": partial(
+            read_command,
+            "pipeline.verify:verify",
+            "session",
+            "captures",
+            options=[JSON],
+            names={"models": "model", "depth_range": "range"},
+        ),
+        "merge": partial(read_command, "pipeline.merge:merge", "session", "captures", options=[JSON]),
+        "mesh": partial(
+            read_command, "pipeline.mesh:mesh", "session", "names", options=[*MESHING, JSON], run=run_meshing
+        ),
+        "compare": partial(read_command, "pipeline.compare:compare", "session", "scan", "nominal", options=[JSON]),
+        "measure": partial(
+            read_command,
+            "pipeline.measure:measure",
+            "session",
+            "scan",
+            "what",
+            run=partial(show_result, describe=describe_measurement),
+        ),
+        "measurements": partial(read_command, "pipeline.measure:edit_measurements", "session"),
+        "export": partial(
+            read_command,
+            "pipeline.export:export",
+            "session",
+            "what",
+            "name",
+            options=MESHING,
+            names={"file_format": "format"},
+            run=run_meshing,
+        ),
+        "batch": partial(read_command, "pipeline.batch:batch", "sessions", options=[JSON]),
+        "check": partial(read_command, "pipeline.check:check", "session", "capture", options=[JSON]),
+        "accept": partial(read_command, "pipeline.accept:accept", "session", options=[JSON]),
+        "simulate": partial(
+            read_command,
+            "pipeline.simulate:simulate",
+            "session",
+            run=partial(show_result, describe=describe_simulation),
+        ),
+        "reproduce": partial(read_command, "validation.reproduce:reproduce", options=[JSON]),
+        "prove": partial(read_command, "validation.prove:prove", options=[JSON], names={"cases": "case"}),
+        "patterns": partial(read_command, "pipeline.printouts:patterns"),
+        "target": partial(read_command, "pipeline.printouts:target", "board"),
+        "detect": partial(
+            read_command, "pipeline.detect:detect_board", "images", options=[JSON], names={"csv_out": "csv"}
+        ),
+        "report": partial(read_command, "pipeline.report:report", "session"),
+        "inspect": partial(read_command, "pipeline.inspect:inspect", "session"),
+        "bench": partial(read_command, "validation.bench:bench", options=[JSON]),
+    }
+)
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -98,12 +139,13 @@ def main(arguments: list[str] | None = None) -> int:
     if arguments == ["--version"]:
         print(f"slviewer {__version__}")
         return 0
+    name = arguments[0]
     try:
         run = tyro.cli(
-            union(COMMANDS),
-            prog="slviewer",
-            description="Structured-light 3D scanning: calibrate a camera and a projector, prove it, scan, merge.",
-            args=arguments,
+            COMMANDS[name] if name in COMMANDS else union(COMMANDS),
+            prog=f"slviewer {name}" if name in COMMANDS else "slviewer",
+            description=None if name in COMMANDS else DESCRIPTION,
+            args=arguments[1:] if name in COMMANDS else arguments,
             config=(
                 tyro.conf.OmitArgPrefixes,
                 tyro.conf.OmitSubcommandPrefixes,

@@ -109,55 +109,56 @@ def _make_captures_command(
     )
 
 
-LAYOUTS = {
-    "auto": _make_captures_command(
-        "detect", "Import folders whose layout is known by their file names, or by a TOML that lies in the folder."
-    ),
-    "p18": _make_captures_command(
-        "p18",
-        "Import folders of the p18 layout: pose_XX/{V,H}/P18_FNN.PNG, 18 phase steps and 7 Gray bits an axis.",
-        projector="912x1140",
-    ),
-    "procam-calibration": _make_captures_command(
-        "procam-calibration",
-        "Import folders of the procam-calibration layout: capture_N/graycode_NN.*, Gray code with "
-        "inverses, white, black.",
-        projector="1024x768",
-    ),
-    "opencv-graycode": _make_captures_command(
-        "opencv-graycode",
-        "Import the images of OpenCV's structured_light GrayCodePattern: columns, then rows, each bit with its inverse."
-        "\n\nImages are read in natural order of their names.",
-        FILES,
-    ),
-    "sltk": _make_captures_command(
-        "sltk", "Import folders of the sltk layout: TIME_[AA-BB-CC_NN]_img.jpg, Gray code with inverses."
-    ),
-    "slstudio": _make_captures_command(
-        "slstudio",
-        "Import the frames that SLStudio writes: frameSeq_NN.bmp.\n\nWith the diamond pattern, the projector's size "
-        "has twice its columns.",
-        CODEC,
-        AXIS,
-    ),
-    "frames": _make_captures_command(
-        "frames",
-        "Import any folder of images with a TOML that describes them, or propose that TOML with --guess FOLDER.",
-        *DESCRIBED,
-        run=run_frames,
-        source=None,
-        session=None,
-    ),
-    "opencv-calibration": read_command(
-        "pipeline.import_calibration:import_opencv_calibration", "file", "session", run=run_import_calibration
-    ),
-}
+def make_import_command() -> Callable[..., Callable[[], None]]:
+    """Return the command with one subcommand a layout."""
+    layouts = {
+        "auto": _make_captures_command(
+            "detect", "Import folders whose layout is known by their file names, or by a TOML that lies in the folder."
+        ),
+        "p18": _make_captures_command(
+            "p18",
+            "Import folders of the p18 layout: pose_XX/{V,H}/P18_FNN.PNG, 18 phase steps and 7 Gray bits an axis.",
+            projector="912x1140",
+        ),
+        "procam-calibration": _make_captures_command(
+            "procam-calibration",
+            "Import folders of the procam-calibration layout: capture_N/graycode_NN.*, Gray code with "
+            "inverses, white, black.",
+            projector="1024x768",
+        ),
+        "opencv-graycode": _make_captures_command(
+            "opencv-graycode",
+            "Import the images of OpenCV's structured_light GrayCodePattern: columns, then rows, each bit with its "
+            "inverse.\n\nImages are read in natural order of their names.",
+            FILES,
+        ),
+        "sltk": _make_captures_command(
+            "sltk", "Import folders of the sltk layout: TIME_[AA-BB-CC_NN]_img.jpg, Gray code with inverses."
+        ),
+        "slstudio": _make_captures_command(
+            "slstudio",
+            "Import the frames that SLStudio writes: frameSeq_NN.bmp.\n\nWith the diamond pattern, the projector's "
+            "size has twice its columns.",
+            CODEC,
+            AXIS,
+        ),
+        "frames": _make_captures_command(
+            "frames",
+            "Import any folder of images with a TOML that describes them, or propose that TOML with --guess FOLDER.",
+            *DESCRIBED,
+            run=run_frames,
+            source=None,
+            session=None,
+        ),
+        "opencv-calibration": read_command(
+            "pipeline.import_calibration:import_opencv_calibration", "file", "session", run=run_import_calibration
+        ),
+    }
 
+    def import_command(command: Any) -> Callable[[], None]:
+        """Import captures or calibrations that other tools made."""
+        run: Callable[[], None] = command
+        return run
 
-def import_command(command: Any) -> Callable[[], None]:
-    """Import captures or calibrations that other tools made."""
-    run: Callable[[], None] = command
-    return run
-
-
-import_command.__annotations__["command"] = union(LAYOUTS)
+    import_command.__annotations__["command"] = union(layouts)
+    return import_command

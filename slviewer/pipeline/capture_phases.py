@@ -17,7 +17,7 @@ from slviewer.fringe.reference import dark_limit, dark_sigmas
 from slviewer.fringe.scatter import SIGNIFICANT, measure_scatter
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.pipeline.feedback import Warn, ignore_warnings
-from slviewer.pipeline.frame_check import FrameCheck, check_frames, load_check
+from slviewer.pipeline.frame_check import FrameCheck, load_check, load_or_save_check
 from slviewer.session.capture import Capture
 from slviewer.session.store import Session
 
@@ -177,12 +177,12 @@ def convert_to_8bit(image: np.ndarray) -> np.ndarray:
 
 
 def decode_captures(
-    session: Session, names: Sequence[str], warn: Warn = ignore_warnings, *, relative: bool = False
+    session: Session, names: Sequence[str], warn: Warn = ignore_warnings, *, relative: bool = False, check: bool = True
 ) -> Iterator[tuple[Capture, np.ndarray, dict[Axis, PhaseMap]]]:
     """Captures with their frames and phases, in order; the next one's frames are read while one is processed.
 
     ``warn`` is called with frames that contradict the others, and with the reasons why many pixels are masked;
-    ``relative`` as in `decode_capture`.
+    ``relative`` as in `decode_capture`. ``check``: compare the frames of captures that have no saved comparison.
     """
     captures = [session.load_capture(name) for name in names]
     if not captures:
@@ -195,8 +195,8 @@ def decode_captures(
                 ahead = reader.submit(captures[i + 1].stack)
             phases = decode_capture(capture, frames, relative=relative)
             if warn is not ignore_warnings:
-                check = load_check(session, capture.name) or check_frames(capture.sequence, frames)
-                for message in check.warnings():
+                compared = load_or_save_check(session, capture, frames) if check else load_check(session, capture.name)
+                for message in compared.warnings() if compared else ():
                     warn(f"{capture.name}: {message}")
                 for message in loss_warnings(capture.sequence, frames, phases):
                     warn(f"{capture.name}: {message}")

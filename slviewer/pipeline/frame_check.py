@@ -74,10 +74,11 @@ def check_frames(sequence: PatternSequence, stack: np.ndarray) -> FrameCheck:
 
 
 def save_check(session: Session, capture: Capture, frames: np.ndarray | None = None) -> FrameCheck:
-    """Check a capture's ``frames`` (n, h, w), read here if None, and save the result."""
+    """Check a capture's ``frames`` (n, h, w), read here if None, and save the result in a writable session."""
     check = check_frames(capture.sequence, capture.frames if frames is None else frames)
-    meta = {"inputs": {capture.name: capture.hash}, "version": VERSION, **check.to_json()}
-    session.save_result(f"trust/{capture.name}", meta, {})
+    if session.is_writable:
+        meta = {"inputs": {capture.name: capture.hash}, "version": VERSION, **check.to_json()}
+        session.save_result(f"trust/{capture.name}", meta, {})
     return check
 
 

@@ -99,6 +99,7 @@ def reconstruct(
     grid: Path | str | None = None,
     mesh: bool = False,
     accept_rejected: bool = False,
+    check: bool = True,
     progress: Progress = ignore_progress,
     warn: Warn = ignore_warnings,
 ) -> Reconstruction:
@@ -116,6 +117,8 @@ def reconstruct(
         grid: Also write the whole organised cloud, (h, w, 3) float32 mm, NaN where invalid, as .npy.
         mesh: Put the triangles between neighbouring pixels into the PLY.
         accept_rejected: Use the calibration although its verdict rejects it.
+
+    ``check``: also compare the frames with each other, and warn of those that do not fit.
     """
     with opened(session) as store:
         check_accepted(store, accept_rejected)
@@ -123,7 +126,7 @@ def reconstruct(
         warn_if_stale(store, warn)
         check_capture_sizes(store, [capture])
         progress(0.1, "reading and decoding")
-        shot, frames, decoded = next(decode_captures(store, [capture], warn, relative=True))
+        shot, frames, decoded = next(decode_captures(store, [capture], warn, relative=True, check=check))
         phases = absolute_phases(store, capture, decoded, depth_range, warn)
         texture = capture_texture(shot, frames)
         is_pose = shot.role == "calibration"

@@ -86,6 +86,7 @@ def verify(
     radius: float | None = None,
     axis: Axis | None = None,
     accept_rejected: bool = False,
+    check: bool = True,
     progress: Progress = ignore_progress,
     warn: Warn = ignore_warnings,
 ) -> Verification:
@@ -100,6 +101,8 @@ def verify(
         radius: Nominal radius of the sphere, mm: helps to detect it; the fitted radius stays free.
         axis: Which pattern axis gives the depth; by default the one with the smaller predicted noise.
         accept_rejected: Use the calibration although its verdict rejects it.
+
+    ``check``: also compare the frames with each other, and warn of those that do not fit.
     """
     if not captures:
         raise UsageError("no capture named: give the captures to measure, for instance plane_01 plane_02")
@@ -115,7 +118,7 @@ def verify(
         warn_if_stale(store, warn)
         reach = depth_range or load_stereo(store).depth_range_mm
         check_capture_sizes(store, captures)
-        for i, (shot, frames, phases) in enumerate(decode_captures(store, captures, warn)):
+        for i, (shot, frames, phases) in enumerate(decode_captures(store, captures, warn, check=check)):
             progress(i / len(captures), f"measuring {shot.name}")
             clouds = reconstruct_models(store, chosen, shot, phases, axis, accept_rejected=accept_rejected, warn=warn)
             region: np.ndarray | None = None
