@@ -151,7 +151,6 @@ def _estimate_uncertainty(points: np.ndarray, normal: np.ndarray, residual: np.n
 def _sum_by_cube(values: np.ndarray, points: np.ndarray, side: float) -> np.ndarray:
     """Return the sums (m, k) of ``values`` (n, k) over the m occupied cubes of ``side`` mm of ``points`` (n, 3)."""
     cell = np.floor(points / side).astype(np.int64)
-    _, which = np.unique(cell, axis=0, return_inverse=True)
-    sums = np.zeros((int(which.max()) + 1, values.shape[1]))
-    np.add.at(sums, which.ravel(), values)
-    return sums
+    cell -= cell.min(axis=0)
+    _, which = np.unique(np.ravel_multi_index(tuple(cell.T), tuple(cell.max(axis=0) + 1)), return_inverse=True)
+    return np.stack([np.bincount(which, column) for column in values.T], axis=1)

@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 from scipy.spatial import cKDTree
 
-from slviewer.geometry.rigid import fit_rigid, rigid_transform
+from slviewer.geometry.rigid import fit_rigid, move_points, rigid_transform
 from slviewer.registration.open3d_loader import align_icp, open3d
 from slviewer.registration.prepared import PreparedScan
 
@@ -67,8 +67,7 @@ def rank_starts(
 
 def pose_distance(points: np.ndarray, T: np.ndarray, other: np.ndarray) -> float:
     """Return the largest coordinate difference in mm of some 20 of the points (n, 3) between two poses (4, 4)."""
-    probe = points[:: max(1, len(points) // 20)]
-    return float(np.abs(probe @ (T - other)[:3, :3].T + (T - other)[:3, 3]).max())
+    return float(np.abs(move_points(T - other, points[:: max(1, len(points) // 20)])).max())
 
 
 def _score_pose(scan: Any, reference: Any, tree: cKDTree, T: np.ndarray, voxel: float) -> float:
@@ -104,20 +103,23 @@ def _feature_poses(scanned: PreparedScan, referred: PreparedScan, voxel: float) 
     if len(triplets) == 0:
         return []
     motions = fit_rigid(p[triplets], q[triplets])
+    normal_products = np.einsum("ni,nj->nij", m, n).reshape(-1, 9)
     votes = np.empty(len(motions), dtype=np.int64)
-    for chunk in np.array_split(np.arange(len(motions)), max(1, len(motions) * len(p) // 1_000_000)):
+    for chunk in np.array_split(np.arange(len(motions)), max(1, len(motions) * len(p) // 100_000)):
         R, t = motions[chunk, :3, :3], motions[chunk, :3, 3]
-        moved = np.einsum("kij,nj->kni", R, p) + t[:, None]
-        close = np.sum((moved - q) ** 2, axis=2) < (1.5 * voxel) ** 2
-        alike = np.einsum("kij,nj,ni->kn", R, n, m, optimize=True) > 0.8
+        gap = R.reshape(-1, 3) @ p.T
+        gap = gap.reshape(len(chunk), 3, len(p)) + (t[:, :, None] - q.T)
+        close = np.einsum("kin,kin->kn", gap, gap) < (1.5 * voxel) ** 2
+        alike = R.reshape(-1, 9) @ normal_products.T > 0.8
         votes[chunk] = np.count_nonzero(close & alike, axis=1)
 
     poses: list[np.ndarray] = []
-    for k in np.argsort(-votes, kind="stable"):
-        if len(poses) == _CANDIDATES or votes[k] < max(4.0, _LEAST_VOTES * votes.max()):
-            break
-        if all(pose_distance(p, motions[k], other) > 5.0 * voxel for other in poses):
-            poses.append(motions[k])
+    order = np.argsort(-votes, kind="stable")
+    rest = motions[order[votes[order] >= max(4.0, _LEAST_VOTES * votes.max())]]
+    while len(rest) and len(poses) < _CANDIDATES:
+        poses.append(rest[0])
+        gaps = move_points(rest - rest[0], p[:: max(1, len(p) // 20)])
+        rest = rest[np.abs(gaps).max(axis=(1, 2)) > 5.0 * voxel]
     return poses
 
 

@@ -5,7 +5,7 @@ a background, the background's points violate free space under the object's moti
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
@@ -17,7 +17,7 @@ from slviewer.reconstruction.cloud import Cloud
 from slviewer.registration.multiway import Alignment, Pair, Starts, register_all
 from slviewer.registration.open3d_loader import open3d
 from slviewer.registration.pairwise import Progress
-from slviewer.registration.prepared import LEAST_POINTS
+from slviewer.registration.prepared import LEAST_POINTS, sort_spatially
 from slviewer.registration.refusal import Refused
 
 SIGMAS = 5.0
@@ -48,7 +48,7 @@ class SurfaceSamples:
 
     ``points`` (n, 3) mm, unit ``normals`` (n, 3) towards the camera, ``ray_tree`` of the rays (x/z, y/z),
     ``ray_distance`` (n,) from each ray to the fourth nearest other one, ``point_tree`` of the points, and the indices
-    ``neighbours`` (n, 8) of each point's nearest ones.
+    ``neighbours`` (n, 8) of each point's nearest ones. ``heights``: cached results of ``heights_above``.
     """
 
     points: np.ndarray
@@ -57,6 +57,7 @@ class SurfaceSamples:
     ray_distance: np.ndarray
     point_tree: cKDTree
     neighbours: np.ndarray
+    heights: dict[tuple["SurfaceSamples", bytes], np.ndarray] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -184,6 +185,7 @@ def sample_surface(points: np.ndarray) -> SurfaceSamples:
     low, high = np.percentile(points[:: max(1, len(points) // 100_000)], (1.0, 99.0), axis=0)
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
     cloud = cloud.voxel_down_sample(float((high - low).max()) / _SAMPLES_PER_SIDE)
+    cloud = sort_spatially(cloud)
     cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(_NORMAL_POINTS))
     cloud.orient_normals_towards_camera_location(np.zeros(3))
     samples, normals = np.asarray(cloud.points), np.asarray(cloud.normals)
@@ -200,18 +202,30 @@ def heights_above(scan: SurfaceSamples, onto: SurfaceSamples, T: np.ndarray) -> 
     """Return the heights (n,) mm of a scan's samples, moved by ``T`` (4, 4), above another scan's surface.
 
     Heights are along that surface's normal, positive in front of it as seen from its camera, and medians over each
-    sample's neighbourhood; NaN outside the other scan's view.
+    sample's neighbourhood; NaN outside the other scan's view. Cached.
     """
+    key = onto, T.tobytes()
+    if key not in scan.heights:
+        scan.heights[key] = _compute_heights(scan, onto, T)
+    return scan.heights[key]
+
+
+def _compute_heights(scan: SurfaceSamples, onto: SurfaceSamples, T: np.ndarray) -> np.ndarray:
+    """Compute ``heights_above``."""
     points = move_points(T, scan.points)
     in_front = points[:, 2] > 0
     rays = points[:, :2] / np.where(in_front, points[:, 2], 1.0)[:, None]
-    distance, nearest = onto.ray_tree.query(rays, workers=-1)
-    in_view = in_front & (distance < onto.ray_distance[nearest])
-    height = np.sum(onto.normals[nearest] * (points - onto.points[nearest]), axis=1)
-    neighbourhood = np.where(in_view[scan.neighbours], height[scan.neighbours], np.nan)
-    heights = np.full(len(points), np.nan)
-    heights[in_view] = np.nanmedian(neighbourhood[in_view], axis=1)
-    return heights
+    reach = np.append(onto.ray_distance, -1.0)  # the last for rays without a sample nearby
+    distance, nearest = onto.ray_tree.query(rays, distance_upper_bound=1.001 * reach.max(), workers=-1)
+    in_view = np.flatnonzero(in_front & (distance < reach[nearest]))
+    nearest = nearest[in_view]
+    height = np.full(len(points), np.nan)
+    height[in_view] = np.sum(onto.normals[nearest] * (points[in_view] - onto.points[nearest]), axis=1)
+    neighbourhood = np.sort(height[scan.neighbours[in_view]], axis=1)  # NaN last
+    count = np.count_nonzero(np.isfinite(neighbourhood), axis=1)
+    row = np.arange(len(count))
+    height[in_view] = 0.5 * (neighbourhood[row, (count - 1) // 2] + neighbourhood[row, count // 2])
+    return height
 
 
 def measure_contradiction(
@@ -250,8 +264,8 @@ def detect_static_points(
     votes = {name: np.zeros(len(s.points)) for name, s in samples.items()}
     poses = alignment.T_reference_scan
     for (first, second), registration in alignment.pairs.items():
-        for scan, onto in ((first, second), (second, first)):
-            T = np.linalg.inv(poses[onto]) @ poses[scan]
+        T_second_first = np.linalg.inv(poses[second]) @ poses[first]
+        for scan, onto, T in ((first, second, T_second_first), (second, first, np.linalg.inv(T_second_first))):
             moved = heights_above(samples[scan], samples[onto], T)
             unmoved = heights_above(samples[scan], samples[onto], np.eye(4))
             gate = estimate_gate(moved, registration.gate_mm)
