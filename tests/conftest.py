@@ -15,8 +15,6 @@ from pathlib import Path
 import pytest
 from chromium import launched
 from filelock import FileLock
-from numba.core.compiler_lock import global_compiler_lock
-from numba.core.dispatcher import Dispatcher
 from playwright.sync_api import Browser, sync_playwright
 
 sys.dont_write_bytecode = False  # what tests start as processes need not compile the sources again
@@ -42,28 +40,6 @@ def disk_without_waits() -> Iterator[None]:
     """Nobody pulls the plug in a test: what the system was given is not waited for until the disk has it as well."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(os, "fsync", lambda descriptor: None)
-        yield
-
-
-@pytest.fixture(scope="session", autouse=True)
-def compiled_once(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """What one worker compiles, the others wait for, and load: their cores have better things to do."""
-    if "PYTEST_XDIST_WORKER" not in os.environ:
-        yield
-        return
-    compile_here, locks = Dispatcher.compile, dict[str, FileLock]()
-    folder = tmp_path_factory.getbasetemp().parent
-
-    def compile_or_load(kernel: Dispatcher, signature: object) -> object:
-        if kernel._cache.cache_path is None:  # it is kept in memory alone
-            return compile_here(kernel, signature)
-        name = f"{kernel.py_func.__module__}.{kernel.py_func.__qualname__}.lock"
-        lock = locks.setdefault(name, FileLock(folder / name, thread_local=False))
-        with global_compiler_lock, lock:  # in this order, in which numba takes its own for what a kernel calls
-            return compile_here(kernel, signature)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Dispatcher, "compile", compile_or_load)
         yield
 
 

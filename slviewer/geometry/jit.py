@@ -4,14 +4,18 @@ import os
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import ExitStack, suppress
 from functools import cache
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import numba
 import numpy as np
+from filelock import FileLock
 from llvmlite import ir
 from numba.core import cgutils
+from numba.core.compiler_lock import global_compiler_lock
 from numba.extending import intrinsic
 
 from slviewer.geometry.jit_cache import cache_folder
@@ -35,11 +39,27 @@ def kernel(*, parallel: bool = False, fastmath: bool = False) -> Callable[[Calla
         with _LOCK:  # numba reads the setting while it decorates; kernels of other packages keep their own folder
             before, _SETTINGS.CACHE_DIR = _SETTINGS.CACHE_DIR, str(folder)
             try:
-                return numba.njit(cache=True, **options)(function)
+                compiled = numba.njit(cache=True, **options)(function)
             finally:
                 _SETTINGS.CACHE_DIR = before
+        compiled.compile = _compile_once(compiled.compile, folder / f"{function.__qualname__}.lock")
+        return compiled
 
     return compile_lazily
+
+
+def _compile_once(compile_here: Callable[[Any], Any], path: Path) -> Callable[[Any], Any]:
+    """Wrap a dispatcher's ``compile(signature)``: what one process compiles, others wait for, and load."""
+    lock = FileLock(path, thread_local=False)
+
+    def compile_or_load(signature: Any) -> Any:
+        """Compile while this process holds the kernel's lock; without it where the disk has no locks."""
+        with global_compiler_lock, ExitStack() as stack:  # in the order in which numba takes its own for callees
+            with suppress(OSError, NotImplementedError):
+                stack.enter_context(lock)
+            return compile_here(signature)
+
+    return compile_or_load
 
 
 def run_rows(function: Callable[..., Any], rows: int, *arguments: Any, multiple: int = 1) -> None:

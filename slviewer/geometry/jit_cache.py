@@ -27,7 +27,7 @@ def cache_folder(module: str) -> Path | None:
     Folders of the same module's earlier sources are deleted.
     """
     try:
-        root = _cache_root()
+        root = cache_root()
         if root is None:
             return None
         folder = root / f"{module}-{hash_sources(module)}"
@@ -78,7 +78,7 @@ def _source_path(module: str) -> Path | None:
 
 
 @cache
-def _cache_root() -> Path | None:
+def cache_root() -> Path | None:
     """The first candidate folder that can be used; None where there is none."""
     return next((place for place in _candidate_folders() if _is_private_and_writable(place)), None)
 

@@ -26,6 +26,7 @@ from slviewer.server.viewers import Viewers
 from slviewer.session.store import Session
 from slviewer.wizard.notices import describe_error
 from slviewer.wizard.operator import Operator
+from slviewer.wizard.preparation import Preparation
 from slviewer.wizard.snapshot import Level
 
 log = logging.getLogger("slviewer.gui")
@@ -200,6 +201,8 @@ def run(
         if rig or not remembered:  # a remembered rig that is not connected now is not replaced by the simulated one
             _check_granted(operator, operator.choose_rig(rig_choice(rig or "simulated", operator.session)))
         app = App(operator, host, port, channel=channel)
+        preparation = Preparation(operator.set_preparing)
+        preparation.start()
         try:
             print(f"slviewer is ready: {app.server.url}")
             print(f"view-only link:    {app.server.view_url}")
@@ -212,6 +215,7 @@ def run(
         except KeyboardInterrupt:
             print("\nslviewer has stopped; the session is saved.")
         finally:
+            preparation.close()
             app.close()
 
 

@@ -308,6 +308,9 @@ def _running_work(snapshot: Snapshot) -> list[tuple[str, float]]:
     if job is not None and not job.background:
         waiting = f", {job.waiting} waiting" if job.waiting else ""
         work.append((f"{job.name}: {job.stage or 'starting'}{waiting} ({job.seconds:.0f} s)", job.share))
+    if snapshot.preparing is not None:
+        text = f"Preparing, {100 * snapshot.preparing:.0f} %: first steps may take longer until then"
+        work.append((text, snapshot.preparing))
     return work
 
 

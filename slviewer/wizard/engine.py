@@ -57,6 +57,7 @@ class Engine:
         self.bench: RigSetup | None = None
         self.preflight: Preflight | None = None  # of the rig in use
         self._autopilot = ""
+        self._preparing: float | None = None
         self._merge_failure = ""
         self._choice: Choice | None = None
         self._rig_fault = ""  # why the chosen rig could not even be set up
@@ -224,6 +225,11 @@ class Engine:
         self._autopilot = act
         self.publisher.mark_changed()
 
+    def set_preparing(self, share: float | None) -> None:
+        """Set the share of the kernels that are compiled in the background; None: none are being compiled."""
+        self._preparing = share
+        self.publisher.mark_changed()
+
     def set_merge_failure(self, why: str) -> None:
         """Set the reason why the last merge failed; empty: it did not."""
         self._merge_failure = why
@@ -369,6 +375,7 @@ class Engine:
             live=self.live.figures() if self.live is not None and self.live.is_running else None,
             merge_failure=self._merge_failure,
             read_failure=read_failure,
+            preparing=self._preparing,
         )
 
     def _follow_up(self, snapshot: Snapshot) -> None:

@@ -134,6 +134,10 @@ class Operator(RigRequests, LiveRequests, MergeRequests, MeasureRequests, Import
         """Set the autopilot's current act, which the snapshot shows; empty when it has ended."""
         self._engine.set_autopilot(act)
 
+    def set_preparing(self, share: float | None) -> None:
+        """Set the share of the kernels that are compiled in the background; None: none are being compiled."""
+        self._engine.set_preparing(share)
+
     def notify(self, level: Level, text: str) -> None:
         """Add a notice of the caller's own."""
         self._engine.notices.add(level, text)

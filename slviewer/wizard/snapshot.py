@@ -337,6 +337,7 @@ class Snapshot:
     live: LiveView | None = None  # None while no live scan runs
     merge_failure: str = ""  # why the last merge was refused, or failed
     read_failure: str = ""  # why the session's files could not be read just now
+    preparing: float | None = None  # share of the kernels compiled in the background; None while none are
 
     @property
     def is_busy(self) -> bool:

@@ -4,6 +4,7 @@ import os
 import shutil
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -66,6 +67,13 @@ def test_another_files_change_is_seen_and_code_is_compiled_once(install: Path, t
     assert (value, hits) == ("10", "0") and Path(place).is_relative_to(tmp_path / "home")
     value, hits, place = run(install, "import slviewer.caller", **home)
     assert (value, hits) == ("10", "1")
+
+
+@pytest.mark.slow
+def test_of_two_processes_one_compiles_and_the_other_waits_and_loads(install: Path) -> None:
+    with ThreadPoolExecutor(2) as both:
+        results = [*both.map(lambda _: run(install, "import slviewer.caller"), range(2))]
+    assert sorted((value, hits) for value, hits, _ in results) == [("6", "0"), ("6", "1")]
 
 
 PLACE = "from slviewer.geometry.jit_cache import cache_folder; print(cache_folder('slviewer.caller'))"

@@ -1,0 +1,108 @@
+"""Compiles the kernels that the wizard needs, in a process of its own, while the operator makes the first choices.
+
+The process runs the wizard once on a small simulated rig. It is started where this version of the program has not run
+it yet; kernels that are compiled there are not compiled here (`geometry.jit`).
+"""
+
+import hashlib
+import os
+import subprocess
+import sys
+import tempfile
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+import numba
+from llvmlite import binding
+
+from slviewer.geometry.jit_cache import cache_root, hash_sources
+from slviewer.wizard.autopilot import RIG, Autopilot
+from slviewer.wizard.notices import log
+from slviewer.wizard.operator import Operator
+
+SCALE = 0.2
+"""Of the rig's resolution: small, and every step still succeeds."""
+COMMAND = [sys.executable, "-m", "slviewer.wizard.preparation"]
+_ACTS = 32  # of an autopilot with eight poses
+
+
+class Preparation:
+    """The process that compiles.
+
+    ``report`` is called, on a thread of its own, with the share of its work that is done, and with None at the end.
+    """
+
+    def __init__(self, report: Callable[[float | None], None]) -> None:
+        self._report = report
+        self._process: subprocess.Popen[str] | None = None
+        self._thread = threading.Thread(target=self._run, name="slviewer preparation", daemon=True)
+
+    def start(self) -> None:
+        """Start the process, unless everything is compiled."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """End the process; what it has compiled is saved."""
+        if self._process is not None:
+            self._process.kill()
+
+    def _run(self) -> None:
+        """Start the process, follow its progress, and note when it has ended well."""
+        done = prepared_file()
+        if done is None or done.exists():
+            return
+        environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
+        pipe = subprocess.PIPE
+        try:
+            self._process = subprocess.Popen(
+                COMMAND, stdin=pipe, stdout=pipe, stderr=subprocess.DEVNULL, text=True, env=environment
+            )
+        except OSError as error:  # kernels are then compiled when they are first used
+            log.warning("kernels cannot be compiled beforehand: %s", error)
+            return
+        assert self._process.stdout is not None
+        for line in self._process.stdout:
+            self._report(float(line))
+        if self._process.wait() == 0:
+            done.touch()
+        self._report(None)
+
+
+def prepared_file() -> Path | None:
+    """The file that exists once the kernels of these sources are compiled for this machine; None without a cache."""
+    root = cache_root()
+    if root is None:
+        return None
+    compiler = f"{sys.version} {numba.__version__} {binding.get_host_cpu_name()}"
+    return root / f"prepared-{hash_sources(__name__)}-{hashlib.blake2b(compiler.encode(), digest_size=8).hexdigest()}"
+
+
+def main() -> None:
+    """Run the wizard once on a small rig, and print the share that is done; ends when standard input is closed."""
+    threading.Thread(target=_exit_with_parent, daemon=True).start()
+    if hasattr(os, "nice"):
+        os.nice(10)
+    acts = 0
+
+    def report(act: str) -> None:
+        """Print the share of the acts that are done."""
+        nonlocal acts
+        print(min(0.99, acts / _ACTS), flush=True)
+        acts += 1
+
+    with (
+        tempfile.TemporaryDirectory(prefix="slviewer-preparation-", ignore_cleanup_errors=True) as folder,
+        Operator(Path(folder, "session"), {**RIG, "scale": SCALE}) as operator,
+    ):
+        Autopilot(operator, poses=8, before=report).run()
+
+
+def _exit_with_parent() -> None:
+    """End this process once its standard input is closed, as it is when the parent ends in any way."""
+    sys.stdin.read()
+    os._exit(1)
+
+
+if __name__ == "__main__":
+    main()

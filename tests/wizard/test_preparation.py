@@ -1,0 +1,60 @@
+"""Kernels are compiled in the background at the first start, and never again."""
+
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+
+from slviewer.wizard import preparation
+from slviewer.wizard.preparation import Preparation, prepared_file
+
+SCRIPT = "import sys; print(0.0); print(0.5, flush=True); sys.exit({status})"
+
+
+@pytest.fixture
+def done(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The file that says that everything is compiled, which is not there yet."""
+    monkeypatch.setattr(preparation, "cache_root", lambda: tmp_path)
+    file = prepared_file()
+    assert file is not None and not file.exists()
+    return file
+
+
+def prepare(status: int, monkeypatch: pytest.MonkeyPatch) -> list[float | None]:
+    """What is reported by a process that ends with this status."""
+    monkeypatch.setattr(preparation, "COMMAND", [sys.executable, "-c", SCRIPT.format(status=status)])
+    reports: list[float | None] = []
+    ended = threading.Event()
+
+    def report(share: float | None) -> None:
+        reports.append(share)
+        if share is None:
+            ended.set()
+
+    preparation_process = Preparation(report)
+    preparation_process.start()
+    if not ended.wait(0.5 if prepared_file().exists() else 30):  # type: ignore[union-attr]
+        preparation_process.close()
+    return reports
+
+
+def test_progress_is_reported_and_the_next_start_compiles_nothing(done: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert prepare(0, monkeypatch) == [0.0, 0.5, None]
+    assert done.exists()
+    assert prepare(0, monkeypatch) == []
+
+
+def test_what_failed_is_tried_again_at_the_next_start(done: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert prepare(1, monkeypatch) == [0.0, 0.5, None]
+    assert not done.exists()
+
+
+@pytest.mark.slow
+def test_the_process_ends_with_the_program_that_started_it() -> None:
+    process = subprocess.Popen(preparation.COMMAND, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    assert process.stdin is not None and process.stdout is not None
+    assert float(process.stdout.readline()) == 0.0  # it works
+    process.stdin.close()
+    assert process.wait(10) == 1
