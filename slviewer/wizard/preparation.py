@@ -84,6 +84,7 @@ def main() -> None:
     if hasattr(os, "nice"):
         os.nice(10)
     acts = 0
+    print(0.0, flush=True)  # compiling begins with the rig
 
     def report(act: str) -> None:
         """Print the share of the acts that are done."""

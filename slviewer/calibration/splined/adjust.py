@@ -3,8 +3,10 @@
 from collections.abc import Callable, Sequence
 from functools import partial
 
+import numba
 import numpy as np
 from scipy.linalg import cho_solve, lapack
+from threadpoolctl import threadpool_limits
 
 from slviewer.calibration.observe import Observation
 from slviewer.calibration.splined.board_shape import board_frame
@@ -79,6 +81,14 @@ def adjust_bundle(
     Raises InputError as ``gather_data`` does, and CalibrationRejected where the adjustment does not converge, is
     undetermined, or where too few poses agree with each other.
     """
+    with threadpool_limits(numba.get_num_threads(), user_api="blas"):  # for one large matrix, not for many small ones
+        return _adjust(observations, stereo, progress)
+
+
+def _adjust(
+    observations: Sequence[Observation], stereo: StereoModel, progress: Callable[[float], None] | None
+) -> Bundle:
+    """Do what ``adjust_bundle`` does, with the present number of threads."""
     names, data, sample_sigma = gather_data(observations, stereo)
     state = State.from_stereo(stereo, names, len(data.points))
     layout = state.layout
@@ -101,13 +111,12 @@ def adjust_bundle(
         if step > 2:
             is_excluded |= (pose_trust(weights, sigmas, data) < MIN_TRUST).any(axis=1)
         _zero_weights(weights, is_excluded, data)
-        A, b = normal_equations(state, data, residuals, weights)
-        prior.add(A, b, state, strengths)
-        undamped = A.copy()
+        sum_information = partial(_sum_information, state, data, residuals, weights, prior, strengths)
+        A, b = sum_information()
         factor = _cholesky(A)
         count = int(sum(np.count_nonzero(w) for w in weights))
         cost = partial(_cost, weights=weights, prior=prior, strengths=strengths)
-        system = undamped, b, _inverse(factor)(b)
+        system = sum_information, b, _inverse(factor)(b)
         state, residuals, move, damping = _take_step(state, residuals, data, cost, system, damping)
         moved = float(np.sqrt(max(move @ b, 0.0) / count))
         if progress:
@@ -152,6 +161,21 @@ def adjust_bundle(
     )
 
 
+def _sum_information(
+    state: State,
+    data: PoseData,
+    residuals: tuple[np.ndarray, np.ndarray],
+    weights: tuple[np.ndarray, np.ndarray],
+    prior: Prior,
+    strengths: Sequence[float],
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the information matrix (N, N) with the prior's, of which the upper triangle is filled, and the right-hand
+    side (N,)."""
+    A, b = normal_equations(state, data, residuals, weights)
+    prior.add(A, b, state, strengths)
+    return A, b
+
+
 def _residuals(state: State, data: PoseData) -> tuple[np.ndarray, np.ndarray]:
     """Return the residuals of features (n, 2) and of samples (m, 2), px."""
     features, samples = predict_observations(state, data)
@@ -178,23 +202,23 @@ def _take_step(
     residuals: tuple[np.ndarray, np.ndarray],
     data: PoseData,
     cost: Callable[[State, tuple[np.ndarray, np.ndarray]], float],
-    system: tuple[np.ndarray, np.ndarray, np.ndarray],
+    system: tuple[Callable[[], tuple[np.ndarray, np.ndarray]], np.ndarray, np.ndarray],
     damping: float,
 ) -> tuple[State, tuple[np.ndarray, np.ndarray], np.ndarray, float]:
     """Take a Gauss-Newton step; damp it where it does not lower the cost.
 
-    ``system``: information matrix, right-hand side, and full step. Only lenses and relative pose are damped: together
-    with the fields they have a curved valley of the cost at strong distortion. Returns the new state, its residuals,
-    the step, and the damping; the unchanged state where no damping helps.
+    ``system``: function that returns the information matrix, right-hand side, and full step. Only lenses and relative
+    pose are damped: together with the fields they have a curved valley of the cost at strong distortion. Returns the
+    new state, its residuals, the step, and the damping; the unchanged state where no damping helps.
     """
-    information, b, full = system
+    sum_information, b, full = system
     layout, before = state.layout, cost(state, residuals)
     rig = np.arange(layout.rig, layout.camera_field)
     damping = damping / DAMPING_STEP if damping > LEAST_DAMPING else 0.0
     while damping < MOST_DAMPING:
         move = full
         if damping:
-            A = information.copy()
+            A, _ = sum_information()  # anew: the first was overwritten by its factor
             A[rig, rig] *= 1 + damping
             move = _inverse(_cholesky(A))(b)
         after = state.step(move)

@@ -1,9 +1,9 @@
 """The normal equations, summed pose by pose from rows that are never stored."""
 
 from concurrent.futures import ThreadPoolExecutor
-from os import cpu_count
 from typing import NamedTuple
 
+import numba
 import numpy as np
 
 from slviewer.calibration.splined.board_shape import HEIGHT_TERMS
@@ -13,6 +13,7 @@ from slviewer.geometry.jit import kernel
 
 MAX_LANES = 4
 """Largest number of matrices that threads fill in parallel; each has the size of the whole."""
+_ROWS_ADDED = 128  # of two matrices at a time
 
 
 class PoseData(NamedTuple):
@@ -91,14 +92,16 @@ def normal_equations(
                 shares, matrices, right,
             )
         )  # fmt: skip
-    for other in matrices[1:]:
-        matrices[0] += other
+    for first in range(0, layout.size, _ROWS_ADDED):
+        upper = np.s_[first : first + _ROWS_ADDED, first:]
+        for other in matrices[1:]:
+            matrices[0][upper] += other[upper]
     return matrices[0], right.sum(0)
 
 
 def _split_poses(poses: int) -> list[np.ndarray]:
     """The poses of each thread: a kernel's parallel loops take no structures."""
-    lanes = max(1, min(MAX_LANES, cpu_count() or 1, poses))
+    lanes = max(1, min(MAX_LANES, numba.get_num_threads(), poses))
     return [np.arange(lane, poses, lanes) for lane in range(lanes)]
 
 

@@ -61,12 +61,9 @@ def _excess_sigma(residuals: np.ndarray, sigma: np.ndarray) -> float:
     if not known.any():
         return MIN_SIGMA_PX
     r, variance = np.abs(residuals[known]), sigma[known] ** 2
-    low, high = MIN_SIGMA_PX, max(3.0 * float(np.median(r)), MIN_SIGMA_PX)
-    for _ in range(40):
-        middle = 0.5 * (low + high)
-        too_wide = 1.4826 * np.median(r / np.sqrt(variance + middle**2)) > 1.0
-        low, high = (middle, high) if too_wide else (low, middle)
-    return high
+    # 1.4826 median(r / sqrt(variance + excess^2)) = 1: half of the residuals are on either side of it
+    excess = np.sqrt(max(float(np.median((1.4826 * r) ** 2 - variance)), 0.0))
+    return float(np.clip(excess, MIN_SIGMA_PX, max(3.0 * float(np.median(r)), MIN_SIGMA_PX)))
 
 
 def pose_sigmas(features: np.ndarray, feature_from: np.ndarray, noise: Noise) -> np.ndarray:
