@@ -71,7 +71,7 @@ def style_image_axes(axes: Any, title: str = "", colour: str = INK) -> None:
     """Style the axes of an image: a title, no ticks and no frame."""
     style_axes(axes, title, grid=False, colour=colour)
     axes.set_xticks([])
-    axes.set_yticks([])
+    axes.yaxis.set_visible(False)
     for spine in axes.spines.values():
         spine.set_visible(False)
 
