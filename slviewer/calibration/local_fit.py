@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from slviewer.geometry.jit import kernel
+from slviewer.geometry.jit import kernel, run_rows
 
 MAX_OFF_CENTRE = 0.35
 """Largest distance, in half widths, between the centroid of a window's samples and its centre; beyond it, the fit would
@@ -20,7 +20,9 @@ def fit_local_values(
     (n, 2) per px along u and v; NaN with fewer than 30 samples in the window, or samples on one side only.
     """
     out = np.full((len(pixels), 3), np.nan)
-    _fit_windows(
+    run_rows(
+        _fit_windows,
+        len(pixels),
         np.ascontiguousarray(field, np.float64),
         np.ascontiguousarray(weight, np.float64),
         np.ascontiguousarray(pixels, np.float64),
@@ -32,7 +34,10 @@ def fit_local_values(
 
 @kernel()
 def _solve_spd(A, b, x):  # type: ignore[no-untyped-def]
-    """Solve A x = b by Cholesky, in place; calling a library's solver would add five seconds of compilation."""
+    """Solve A x = b by Cholesky, from A's lower triangle, in place.
+
+    Calling a library's solver would add five seconds of compilation.
+    """
     n = len(b)
     for i in range(n):
         for j in range(i + 1):
@@ -56,14 +61,17 @@ def _solve_spd(A, b, x):  # type: ignore[no-untyped-def]
 
 
 @kernel()
-def _fit_windows(field, weight, pixels, radius, out):  # type: ignore[no-untyped-def]
-    """Fill ``out`` (n, 3) with value and slopes of a robust quadratic fit around each pixel; NaN where not possible."""
+def _fit_windows(first, last, field, weight, pixels, radius, out):  # type: ignore[no-untyped-def]
+    """Fill ``out`` (n, 3) with value and slopes of a robust quadratic fit around pixels ``first`` to ``last``.
+
+    Where a fit is not possible, ``out`` stays as it is.
+    """
     height, width = field.shape
     basis = np.empty((1024, 6))
     value = np.empty(1024)
     base = np.empty(1024)
     robust = np.empty(1024)
-    for i in range(len(pixels)):
+    for i in range(first, last):
         cu, cv, r = pixels[i, 0], pixels[i, 1], radius[i]
         if not (np.isfinite(cu) and np.isfinite(cv) and r > 1):
             continue
@@ -101,7 +109,7 @@ def _fit_windows(field, weight, pixels, radius, out):  # type: ignore[no-untyped
                     for p in range(6):
                         wp = w * basis[k, p]
                         b[p] += wp * (value[k] - middle)
-                        for q in range(6):
+                        for q in range(p + 1):
                             A[p, q] += wp * basis[k, q]
             trace = 0.0
             for p in range(6):

@@ -221,7 +221,9 @@ def observe(
     pitch = pitch_px(board, detection)
     typical_pitch = float(np.median(pitch))
     box = _bounding_box(inside)
-    bright = {axis: bright_pixels(phase, inside, typical_pitch) for axis, phase in phases.items()}
+    with ThreadPoolExecutor(max(1, len(phases))) as threads:
+        each = threads.map(lambda phase: bright_pixels(phase, inside, typical_pitch), phases.values())
+        bright = dict(zip(phases, each, strict=True))
     projector, _ = _projector_pixels(detection, phases, bright, pitch)
     plane = BoardPlane.fit(detection.pixels, projector, (width, height))
     for axis in phases:

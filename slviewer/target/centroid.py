@@ -3,6 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from slviewer.geometry.jit import kernel, read_only, run_rows
 from slviewer.target.blobs import Blobs
 
 EDGE_WIDTH_PX = 2.5
@@ -31,8 +32,8 @@ def refine_centres(image: NDArray[np.float32], blobs: Blobs) -> NDArray[np.float
     centres, covariances, inverted = blobs.centres, blobs.covariances, blobs.inverted
     ring_px = _ring_widths(centres, covariances)
     refined = np.full(centres.shape, np.nan)
-    for k, (centre, covariance) in enumerate(zip(centres, covariances, strict=True)):
-        refined[k] = _measure_centroid(image, centre, covariance, float(ring_px[k]), inverted)
+    arrays = [read_only(np.ascontiguousarray(each, np.float64)) for each in (centres, covariances, ring_px)]
+    run_rows(_measure_centroids, len(centres), read_only(np.ascontiguousarray(image)), *arrays, inverted, refined)
     off = np.linalg.norm(refined - centres, axis=1)
     refined[~(off < np.sqrt(covariances[:, 0, 0] + covariances[:, 1, 1]))] = np.nan
     return refined
@@ -51,66 +52,115 @@ def _ring_widths(centres: np.ndarray, covariances: np.ndarray) -> np.ndarray:
     return np.asarray(apart.min(1) - own - other)
 
 
-def _measure_centroid(
-    image: np.ndarray, centre: np.ndarray, covariance: np.ndarray, gap: float, inverted: bool
-) -> tuple[float, float]:
-    """Return the sub-pixel centroid (u, v) px of one circle; NaN where it cannot be measured."""
-    soft = min(EDGE_WIDTH_PX, 0.3 * gap)
-    reach = 2 * np.sqrt(np.diag(covariance)) + min(EDGE_WIDTH_PX + RING_PX, gap - soft) + 1
-    u0, v0 = np.maximum(np.floor(centre - reach), 0).astype(int)
-    u1, v1 = np.minimum(np.ceil(centre + reach) + 1, image.shape[::-1]).astype(int)
-    patch = image[v0:v1, u0:u1].astype(np.float64)
-    du, dv = np.meshgrid(np.arange(u0, u1) - centre[0], np.arange(v0, v1) - centre[1])
-    (a, b), (_, c) = np.linalg.inv(covariance) / 4
-    radius = np.sqrt(a * du * du + 2 * b * du * dv + c * dv * dv)  # 1 on the edge
-    beyond = np.hypot(du, dv) * (1 - 1 / np.maximum(radius, 1e-6))  # px from the edge, outwards
-    ring = (beyond > soft) & (beyond < min(EDGE_WIDTH_PX + RING_PX, gap - soft))
-    if np.count_nonzero(ring) < MIN_RING_PIXELS:
-        return np.nan, np.nan
-    within = beyond < soft
-    ground = _fit_paper_level(du, dv, patch, ring, _quantile(patch[radius < CORE_RADIUS], 0.5))
-    if inverted:
-        light = _fit_plane(du, dv, patch, radius < CORE_RADIUS)
-        ink = (patch - ground) / np.maximum(light, 1.0)
-    else:
-        ink = 1 - patch / np.maximum(ground, 1.0)
-    ink = ink[within]
-    total = ink.sum()
-    if total <= 0:
-        return np.nan, np.nan
-    return float(centre[0] + ink @ du[within] / total), float(centre[1] + ink @ dv[within] / total)
+@kernel()
+def _measure_centroids(first, last, image, centres, covariances, gaps, inverted, out):
+    """Fill ``out`` (n, 2) with the centroids px of circles ``first`` to ``last``; others stay as they are.
+
+    ``gaps`` (n,): width px of the paper around each circle.
+    """
+    height, width = image.shape
+    for k in range(first, last):
+        u, v = centres[k]
+        (xx, xy), (_, yy) = covariances[k]
+        soft = min(EDGE_WIDTH_PX, 0.3 * gaps[k])
+        end = min(EDGE_WIDTH_PX + RING_PX, gaps[k] - soft)
+        far_u, far_v = 2 * np.sqrt(xx) + end + 1, 2 * np.sqrt(yy) + end + 1
+        determinant = xx * yy - xy * xy
+        if not (np.isfinite(u + v + far_u + far_v) and determinant > 0.0):
+            continue
+        u0, v0 = max(int(np.floor(u - far_u)), 0), max(int(np.floor(v - far_v)), 0)
+        u1, v1 = min(int(np.ceil(u + far_u)) + 1, width), min(int(np.ceil(v + far_v)) + 1, height)
+        size = max(u1 - u0, 0) * max(v1 - v0, 0)
+        place, level = np.empty((2, size)), np.empty(size)
+        within, ring, core = np.zeros(size, np.bool_), np.zeros(size, np.bool_), np.zeros(size, np.bool_)
+        i = 0
+        for row in range(v0, v1):
+            for column in range(u0, u1):
+                du, dv = column - u, row - v
+                square = (yy * du * du - 2 * xy * du * dv + xx * dv * dv) / (4 * determinant)
+                radius = np.sqrt(max(square, 0.0))  # 1 on the edge
+                beyond = np.sqrt(du * du + dv * dv) * (1 - 1 / max(radius, 1e-6))  # px from the edge, outwards
+                place[0, i], place[1, i], level[i] = du, dv, image[row, column]
+                within[i], ring[i], core[i] = beyond < soft, soft < beyond < end, radius < CORE_RADIUS
+                i += 1
+        if np.count_nonzero(ring) < MIN_RING_PIXELS or not core.any():
+            continue
+        ground = _fit_paper_level(place, level, ring, _quantile(level[core], 0.5))
+        light = _fit_plane(place, level, core) if inverted else ground
+        total, moment_u, moment_v = 0.0, 0.0, 0.0
+        for i in range(size):
+            if within[i]:
+                paper, own = _plane_at(ground, place, i), max(_plane_at(light, place, i), 1.0)
+                ink = (level[i] - paper) / own if inverted else 1 - level[i] / own
+                total += ink
+                moment_u += ink * place[0, i]
+                moment_v += ink * place[1, i]
+        if total > 0.0:
+            out[k, 0], out[k, 1] = u + moment_u / total, v + moment_v / total
 
 
-def _fit_paper_level(du: np.ndarray, dv: np.ndarray, patch: np.ndarray, ring: np.ndarray, ink: float) -> np.ndarray:
-    """Fit a plane (h, w) to the brightness of the ``ring`` (h, w) bool around a circle, without edges or other blobs.
+@kernel()
+def _fit_paper_level(place, level, ring, ink):
+    """Fit a plane to the brightness ``level`` (n,) of the ``ring`` (n,) around a circle, without edges or other blobs.
 
     Where the ring does not fit one plane, the fit starts with the quarter that differs most from the circle's own level
-    ``ink`` and continues with the pixels within the noise of the plane.
+    ``ink`` and continues with the pixels within the noise of the plane. ``place`` (2, n) px from the circle's centre.
     """
-    plane = _fit_plane(du, dv, patch, ring)
-    levels = patch[ring]
+    plane = _fit_plane(place, level, ring)
+    levels = level[ring]
     ground = _quantile(levels, 0.75 if ink < _quantile(levels, 0.5) else 0.25)
     contrast = abs(ground - ink)
-    if np.abs(levels - plane[ring]).max() < FLATNESS * contrast:
+    off = _distances(plane, place, level)
+    if off[ring].max() < FLATNESS * contrast:
         return plane
-    near = ring & (np.abs(patch - ground) < INITIAL_GATE * contrast)
+    near = ring & (np.abs(level - ground) < INITIAL_GATE * contrast)
     for _ in range(2):
         if np.count_nonzero(near) < MIN_RING_PIXELS:
             return plane
-        plane = _fit_plane(du, dv, patch, near)
-        off = np.abs(patch - plane)
+        plane = _fit_plane(place, level, near)
+        off = _distances(plane, place, level)
         near = ring & (off < max(GATE_SIGMAS * 1.4826 * _quantile(off[near], 0.5), FLATNESS * contrast))
-    return _fit_plane(du, dv, patch, near) if np.count_nonzero(near) >= MIN_RING_PIXELS else plane
+    return _fit_plane(place, level, near) if np.count_nonzero(near) >= MIN_RING_PIXELS else plane
 
 
-def _quantile(values: np.ndarray, share: float) -> float:
-    """Return a quantile without interpolation, which for few values is faster than NumPy's."""
-    k = int(share * (len(values) - 1))
-    return float(np.partition(values, k)[k])
+@kernel()
+def _quantile(values, share):
+    """Return a quantile of ``values`` (n,) without interpolation."""
+    return np.sort(values)[int(share * (len(values) - 1))]
 
 
-def _fit_plane(du: np.ndarray, dv: np.ndarray, values: np.ndarray, where: np.ndarray) -> np.ndarray:
-    """Fit a plane (h, w) to the ``values`` (h, w) ``where`` (h, w) bool, by least squares."""
-    A = np.stack([np.ones(int(np.count_nonzero(where))), du[where], dv[where]], axis=1)
-    c = np.linalg.lstsq(A, values[where], rcond=None)[0]
-    return np.asarray(c[0] + c[1] * du + c[2] * dv)
+@kernel()
+def _fit_plane(place, level, where):
+    """Return the plane (mean level, slope along u, along v, mean u, mean v) of least squares through pixels ``where``.
+
+    Its slopes are 0 where the pixels are on one line.
+    """
+    count, mean_u, mean_v, mean = 0, 0.0, 0.0, 0.0
+    for i in range(len(level)):
+        if where[i]:
+            count, mean_u, mean_v, mean = count + 1, mean_u + place[0, i], mean_v + place[1, i], mean + level[i]
+    mean_u, mean_v, mean = mean_u / count, mean_v / count, mean / count
+    uu, uv, vv, ul, vl = 0.0, 0.0, 0.0, 0.0, 0.0
+    for i in range(len(level)):
+        if where[i]:
+            du, dv, dl = place[0, i] - mean_u, place[1, i] - mean_v, level[i] - mean
+            uu, uv, vv, ul, vl = uu + du * du, uv + du * dv, vv + dv * dv, ul + du * dl, vl + dv * dl
+    determinant = uu * vv - uv * uv
+    if not determinant > 1e-9 * uu * vv:
+        return mean, 0.0, 0.0, mean_u, mean_v
+    return mean, (vv * ul - uv * vl) / determinant, (uu * vl - uv * ul) / determinant, mean_u, mean_v
+
+
+@kernel()
+def _plane_at(plane, place, i):
+    """Return the level of a plane at pixel ``i``."""
+    return plane[0] + plane[1] * (place[0, i] - plane[3]) + plane[2] * (place[1, i] - plane[4])
+
+
+@kernel()
+def _distances(plane, place, level):
+    """Return the distances (n,) of the levels from a plane."""
+    off = np.empty(len(level))
+    for i in range(len(level)):
+        off[i] = abs(level[i] - _plane_at(plane, place, i))
+    return off
