@@ -1,6 +1,7 @@
 """A capture: what the projector showed, what the camera saw, and what it is for."""
 
 import hashlib
+import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -166,12 +167,18 @@ def read_capture(folder: Path) -> Capture:
     meta = read_json(folder / "capture.json")
     try:
         width, height = meta["camera"]["size"]
-        role, sequence, content_hash = meta["role"], PatternSequence.from_dict(meta["sequence"]), str(meta["hash"])
+        role, sequence, content_hash = meta["role"], _read_sequence(json.dumps(meta["sequence"])), str(meta["hash"])
     except (KeyError, TypeError, ValueError, InputError) as error:
         raise SessionError(
             f"{folder / 'capture.json'} is damaged ({error!r}): move the folder away and import it again"
         ) from error
     return Capture(folder.name, role, sequence, (int(width), int(height)), content_hash, folder, meta)
+
+
+@lru_cache(maxsize=16)
+def _read_sequence(text: str) -> PatternSequence:
+    """Return the sequence that JSON describes; cached, as the captures of a session share a few."""
+    return PatternSequence.from_dict(json.loads(text))
 
 
 @lru_cache(maxsize=4)
