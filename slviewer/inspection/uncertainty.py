@@ -9,6 +9,7 @@ from slviewer.calibration.splined.bundle import Bundle
 from slviewer.calibration.splined.uncertainty import extrapolation_factor
 from slviewer.calibration.splined.volume import BestMotion, Volume, view_pixels, working_volume
 from slviewer.fringe.sequence import Axis
+from slviewer.geometry.cubes import occupied_cubes
 
 Shared = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """Called with points (m, 3) and how p parameters answer to their displacement (p, m, 3): (k, p), whose product with
@@ -76,11 +77,11 @@ def scatter_covariance(points: np.ndarray, jacobian: np.ndarray, residuals: np.n
     plain = inverse * float(residuals @ residuals) / max(n - p, 1)
     low = points.min(axis=0)
     side = max(float(np.ptp(points, axis=0).max()) / PATCHES, 1e-12)
-    _, patch = np.unique(((points - low) / side).astype(int), axis=0, return_inverse=True)
-    count = int(patch.max()) + 1
+    cubes, patch = occupied_cubes(points - low, side)
+    count = len(cubes)
     if count <= 2 * p:
         return plain
-    sums = np.stack([np.bincount(patch.ravel(), jacobian[:, k] * residuals, count) for k in range(p)], axis=1)
+    sums = np.stack([np.bincount(patch, jacobian[:, k] * residuals, count) for k in range(p)], axis=1)
     together = inverse @ (sums.T @ sums) @ inverse * count / (count - p)
     # elementwise larger standard deviations, with the correlations of the patches
     ratio = np.sqrt(np.maximum(np.diag(plain) / np.maximum(np.diag(together), 1e-300), 1.0))

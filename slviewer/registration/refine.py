@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from slviewer.geometry.cubes import occupied_cubes
 from slviewer.geometry.rigid import move_points, turn_about
 from slviewer.geometry.robust import robust_sigma, tukey_weights
 from slviewer.registration.prepared import PreparedScan
@@ -150,7 +151,5 @@ def _estimate_uncertainty(points: np.ndarray, normal: np.ndarray, residual: np.n
 
 def _sum_by_cube(values: np.ndarray, points: np.ndarray, side: float) -> np.ndarray:
     """Return the sums (m, k) of ``values`` (n, k) over the m occupied cubes of ``side`` mm of ``points`` (n, 3)."""
-    cell = np.floor(points / side).astype(np.int64)
-    cell -= cell.min(axis=0)
-    _, which = np.unique(np.ravel_multi_index(tuple(cell.T), tuple(cell.max(axis=0) + 1)), return_inverse=True)
+    _, which = occupied_cubes(points, side)
     return np.stack([np.bincount(which, column) for column in values.T], axis=1)

@@ -193,8 +193,8 @@ def sample_surface(points: np.ndarray) -> SurfaceSamples:
     facing &= samples[:, 2] > 0
     samples, normals = samples[facing], normals[facing]
     ray_tree, point_tree = cKDTree(samples[:, :2] / samples[:, 2:]), cKDTree(samples)
-    ray_distance = ray_tree.query(ray_tree.data, k=min(5, len(samples)))[0][:, -1]
-    neighbours = point_tree.query(samples, k=min(8, len(samples)))[1]
+    ray_distance = ray_tree.query(ray_tree.data, k=min(5, len(samples)), workers=-1)[0][:, -1]
+    neighbours = point_tree.query(samples, k=min(8, len(samples)), workers=-1)[1]
     return SurfaceSamples(samples, normals, ray_tree, ray_distance, point_tree, neighbours)
 
 

@@ -4,9 +4,11 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from slviewer.geometry.cubes import occupied_cubes
 from slviewer.reconstruction.cloud import Cloud
 
 STEEPEST = 6.0
@@ -97,16 +99,15 @@ def detect_far_clusters(points: np.ndarray, mask: np.ndarray) -> np.ndarray:
     if len(chosen) < 2:
         return far
     subset = chosen[:: max(1, len(chosen) // 5000)]
-    spacing = float(np.median(cKDTree(chosen).query(subset, k=2)[0][:, 1]))
+    spacing = float(np.median(cKDTree(chosen, balanced_tree=False, compact_nodes=False).query(subset, k=2)[0][:, 1]))
     if not spacing > 0:
         return far
-    cells, which, counts = np.unique(
-        np.floor(chosen / (FAR_SPACINGS * spacing)).astype(np.int64), axis=0, return_inverse=True, return_counts=True
-    )
-    adjacent = cKDTree(cells).sparse_distance_matrix(cKDTree(cells), 1.8).tocsr()  # all 26 neighbours
+    cubes, which = occupied_cubes(chosen, FAR_SPACINGS * spacing)
+    pairs = cKDTree(cubes).query_pairs(1.8, output_type="ndarray")  # all 26 neighbours
+    adjacent = coo_array((np.ones(len(pairs), bool), tuple(pairs.T)), (len(cubes), len(cubes)))
     _, cluster = connected_components(adjacent, directed=False)
-    is_small = np.bincount(cluster, counts) < FAR_SHARE * len(chosen)
-    far[mask] = is_small[cluster][which.ravel()]
+    cluster = cluster[which]
+    far[mask] = (np.bincount(cluster) < FAR_SHARE * len(chosen))[cluster]
     return far
 
 
