@@ -231,10 +231,10 @@ def _is_visible(
     corners = move_points(T, board.outline())
     pixels = lens.project(corners)
     free = _FREE * lens.size[0]
-    inside = ((pixels > free) & (pixels < np.array(lens.size) - 1 - free)).all(axis=(1, 2))
+    inside = np.asarray(((pixels > free) & (pixels < np.array(lens.size) - 1 - free)).all(axis=(1, 2)))
     if illuminated is not None:
         inside[inside] = illuminated(corners[inside].reshape(-1, 3)).reshape(-1, corners.shape[1]).all(axis=1)
-    return np.asarray(inside)
+    return inside
 
 
 def _classify(
