@@ -50,6 +50,7 @@ from slviewer.validation.bench_rows import (
     row,
     time_beside,
 )
+from slviewer.validation.bench_scaling import time_scaling
 from slviewer.validation.bench_wizard import time_wizard
 
 PERIOD_PX = 18.0
@@ -85,6 +86,7 @@ def bench(
     calibration: bool = False,
     live: bool = False,
     wizard: bool = False,
+    scaling: bool = False,
     minutes: float = 0.5,
     scale: float = 1.0,
     progress: Progress = ignore_progress,
@@ -95,11 +97,14 @@ def bench(
         calibration: Also simulate and calibrate 25 poses (minutes, and 3.5 GB of disk at full size).
         live: Also scan live, at half the resolution, with one viewer that draws and one that stalls.
         wizard: Time instead what an operator waits for, at half the resolution, beside its targets.
+        scaling: Time instead how the work grows with pixels, target poses, scans and captures.
         minutes: How long to scan live.
         scale: Resolution of the camera, as a share of 1600x1200.
     """
     if wizard:
         return Benchmark(time_wizard(0.5 * scale, progress), None)
+    if scaling:
+        return Benchmark(time_scaling(progress), None)
     progress(0.0, "rendering a pose")
     rig = letter(scale)
     plan = letter_plan(rig, poses=3)

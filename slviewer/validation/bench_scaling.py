@@ -1,0 +1,158 @@
+"""How time and memory grow with pixels, target poses, scans merged and captures of a session."""
+
+import shutil
+import tempfile
+import tracemalloc
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from slviewer.calibration.observe import Observation, Smoothing
+from slviewer.calibration.splined.model import calibrate_splined
+from slviewer.calibration.stereo import calibrate_stereo
+from slviewer.fringe.decode import decode
+from slviewer.fringe.presets import p18
+from slviewer.fringe.sequence import PatternSequence, one_axis
+from slviewer.pipeline.capture_phases import decode_frames, texture_8bit
+from slviewer.pipeline.feedback import Progress, ignore_progress
+from slviewer.pipeline.poses import read_pose
+from slviewer.pipeline.simulate import TARGET
+from slviewer.reconstruction.cloud import Cloud
+from slviewer.registration.multiway import Starts, register_all
+from slviewer.session.store import Session
+from slviewer.simulation.plans import letter_plan
+from slviewer.simulation.renderer import Renderer
+from slviewer.simulation.rig import SimulatedRig, letter
+from slviewer.simulation.turning import STEP_DEG, turning
+from slviewer.target.board import Board
+from slviewer.validation.bench_rows import median, row
+from slviewer.wizard.planner import Planner
+from slviewer.wizard.session_reader import SessionReader
+from slviewer.wizard.snapshot import RigView
+
+MEGAPIXELS = (0.5, 2.0, 8.0, 24.0)
+POSES = (10, 20, 40)
+SCANS = (3, 6, 12)
+CAPTURES = (50, 150, 500)
+SCALE = 0.25
+"""Of the rig that poses and scans are rendered with."""
+NOISE_MM = 0.02
+SLOW_S = 1.0
+"""What takes longer is measured once."""
+LINEAR = 1.1
+"""Largest exponent that counts as linear."""
+Row = dict[str, Any]
+
+
+def time_scaling(progress: Progress = ignore_progress) -> list[Row]:
+    """Rows of each size, with the largest memory of its arrays, and of each kind the exponent of its growth."""
+    progress(0.0, "pixels")
+    rig = letter(SCALE)
+    plan = letter_plan(rig, poses=max(POSES))
+    rows = _time_pixels(rig, plan["pose_01"])
+    progress(0.2, "captures of a session")
+    rows += _time_captures(rig, plan["pose_01"])
+    progress(0.3, "scans")
+    rows += _time_scans(rig)
+    progress(0.5, "reading poses")
+    rows += _time_poses(rig, plan)
+    progress(1.0, "measured")
+    return rows
+
+
+def _measure_growth(kind: str, sizes: tuple[float, ...], work: Callable[[float], Callable[[], object]]) -> list[Row]:
+    """Time ``work(size)()`` for each size; the last row's note is the exponent fitted to all of them."""
+    seconds, rows = [], []
+    for size in sizes:
+        run = work(size)
+        tracemalloc.start()  # NumPy reports its arrays to it
+        run()  # the first time, which also compiles
+        memory = tracemalloc.get_traced_memory()[1] / 1e6
+        tracemalloc.stop()
+        once = median(run, 1, warm=False)
+        seconds.append(once if once > SLOW_S else median(run, 5, warm=False))
+        rows.append(row(f"{kind}: {size:g}", seconds[-1], memory))
+    exponent = float(np.polyfit(np.log(sizes), np.log(seconds), 1)[0])
+    verdict = "linear or better" if exponent <= LINEAR else "more than linear"
+    rows[-1]["note"] = f"grows with the power {exponent:.2f}: {verdict}"
+    return rows
+
+
+def _time_pixels(rig: SimulatedRig, scene: Any) -> list[Row]:
+    """Rows of decoding 25 frames of several sizes, which are resized from rendered ones."""
+    sequence = one_axis(p18(rig.projector.size), "x")
+    frames = Renderer(rig, scene).capture(sequence)
+
+    def decode_size(megapixels: float) -> Callable[[], object]:
+        """Return the decoding of frames with so many pixels."""
+        scale = np.sqrt(1e6 * megapixels / frames[0].size)
+        large = np.stack([cv2.resize(frame, None, fx=scale, fy=scale) for frame in frames])
+        return lambda: decode(sequence, large, "x")
+
+    return _measure_growth("decode 25 frames, MP", MEGAPIXELS, decode_size)
+
+
+def _time_captures(rig: SimulatedRig, scene: Any) -> list[Row]:
+    """Rows of the wizard's snapshot of a session with so many captures."""
+    with tempfile.TemporaryDirectory(prefix="slviewer-bench-") as folder:
+        sequence = PatternSequence(rig.projector.size, one_axis(p18(rig.projector.size), "x").frames)
+        frames = Renderer(rig, scene).capture(sequence)
+        with Session.open_or_create(Path(folder, "session")) as session:
+            first = session.save_capture("pose_001", "calibration", sequence, frames, source="simulated", board=TARGET)
+            planner = Planner(lambda: None)
+
+            def read_session(count: float) -> Callable[[], object]:
+                """Return the reading of the session, filled up to so many captures."""
+                for number in range(len(session.capture_names()) + 1, int(count) + 1):
+                    shutil.copytree(first.folder, first.folder.parent / f"pose_{number:03d}")
+                reader = SessionReader(session, planner)
+                return lambda: reader.read(RigView(), None)
+
+            rows = _measure_growth("snapshot of a session, captures", CAPTURES, read_session)
+            planner.close()
+    return rows
+
+
+def _time_scans(rig: SimulatedRig) -> list[Row]:
+    """Rows of registering scans of an object on a turntable, with made-up noise."""
+    rng, clouds = np.random.default_rng(0), {}
+    for name, scene in turning().items():
+        points = Renderer(rig, scene).truth().points
+        noisy = points + rng.normal(0, NOISE_MM, points.shape[:2])[..., None] * np.array([0.0, 0.0, 1.0])
+        clouds[name] = Cloud(noisy, "x", "splined", np.full(points.shape[:2], NOISE_MM))
+    names = list(clouds)
+
+    def register(count: float) -> Callable[[], object]:
+        """Return the registration of the first so many scans."""
+        chosen = {name: clouds[name] for name in names[: int(count)]}
+        return lambda: register_all(chosen, names[0], Starts(step_deg=STEP_DEG))
+
+    return _measure_growth("register scans of a turn", SCANS, register)
+
+
+def _time_poses(rig: SimulatedRig, plan: dict[str, Any]) -> list[Row]:
+    """Rows of the stereo calibration and the joint adjustment of so many target poses."""
+    sequence, board = p18(rig.projector.size), Board.parse(TARGET)
+    observations: list[Observation] = []
+    for name in (name for name in plan if name.startswith("pose_")):
+        frames = Renderer(rig, plan[name]).capture(sequence)
+        phases = decode_frames(name, sequence, frames)
+        read = read_pose(name, sequence, frames, phases, texture_8bit(sequence, frames), board, Smoothing())
+        if read.observation is not None:
+            observations.append(read.observation)
+
+    def calibrate(count: float) -> Callable[[], object]:
+        """Return the calibration from the first so many poses."""
+        chosen = observations[: int(count)]
+
+        def fit() -> object:
+            """Fit stereo, then splined."""
+            stereo = calibrate_stereo(chosen, rig.projector.size, TARGET)
+            return calibrate_splined(chosen, stereo)
+
+        return fit
+
+    return _measure_growth("calibrate poses, stereo and splined", POSES, calibrate)
