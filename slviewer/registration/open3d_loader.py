@@ -13,20 +13,33 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
+from types import ModuleType
 from typing import Any
 
 import numpy as np
 
 from slviewer.errors import SlviewerError
 
+_NOTEBOOK_DRAWING = "open3d.visualization.draw_plotly"
+"""Imports Dash and Plotly: nearly half of Open3D's import time."""
+
+
+class _Unused(ModuleType):
+    """A module whose every name is None, in place of one that is not used."""
+
+    def __getattr__(self, name: str) -> None:
+        if name.startswith("__"):
+            raise AttributeError(name)
+
 
 @cache
 def open3d() -> Any:
-    """Return the ``open3d`` module, quiet below errors; the first import needs about a second.
+    """Return the ``open3d`` module, quiet below errors; the first import needs half a second.
 
     Raises ``SlviewerError`` with the remedy where it cannot be imported.
     """
     _supply_libusb()
+    sys.modules.setdefault(_NOTEBOOK_DRAWING, _Unused(_NOTEBOOK_DRAWING))
     try:
         with _uninterrupted():
             import open3d as module

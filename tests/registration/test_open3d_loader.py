@@ -17,6 +17,13 @@ def test_open3d_imports_in_a_fresh_process() -> None:
     assert done.stdout.strip() == "PointCloud"
 
 
+@pytest.mark.slow
+def test_open3d_imports_without_dash() -> None:
+    code = "from slviewer.registration.open3d_loader import open3d; import sys; open3d(); print('dash' in sys.modules)"
+    done = run(code)
+    assert done.stdout.strip() == "False", done.stderr
+
+
 def test_importing_the_loader_does_not_import_open3d() -> None:
     done = run("import sys, slviewer.registration.open3d_loader; print('open3d' in sys.modules)")
     assert done.stdout.strip() == "False", done.stderr
