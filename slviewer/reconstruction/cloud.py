@@ -52,7 +52,8 @@ class Cloud:
     @property
     def mask(self) -> np.ndarray:
         """(h, w) bool: the measured pixels."""
-        return np.isfinite(self.points).all(axis=-1)
+        with np.errstate(invalid="ignore"):  # `all` along a short axis takes ten times as long as a product
+            return np.isfinite(self.points @ np.ones(3, np.float32))
 
     @property
     def measured(self) -> np.ndarray:

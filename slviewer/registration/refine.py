@@ -108,12 +108,12 @@ def _match_pairs(
     near = np.isfinite(distance)
     points, nearest = points[near], nearest[near]
     reference_normals, scan_normals = reference.fine_normals[nearest], scan.fine_normals[::stride][near] @ T[:3, :3].T
-    is_pair = np.sum(reference_normals * scan_normals, axis=1) > _MIN_COSINE
+    is_pair = np.einsum("ij,ij->i", reference_normals, scan_normals) > _MIN_COSINE
     gap = points - reference.fine_points[nearest]
     normal = reference_normals + scan_normals
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
-    residual = np.sum(gap * normal, axis=1)
-    across = np.sqrt(np.maximum(np.sum(gap**2, axis=1) - residual**2, 0.0))
+    normal /= np.maximum(np.sqrt(np.einsum("ij,ij->i", normal, normal)), 1e-9)[:, None]
+    residual = np.einsum("ij,ij->i", gap, normal)
+    across = np.sqrt(np.maximum(np.einsum("ij,ij->i", gap, gap) - residual**2, 0.0))
     is_pair &= (np.abs(residual) < gate) & (across < lateral)  # beyond the rim the nearest point is far across
     return (points[is_pair], normal[is_pair], residual[is_pair]) if np.count_nonzero(is_pair) >= _MIN_PAIRS else None
 
