@@ -83,6 +83,7 @@ def renumber_poses(state: State, data: PoseData, poses: np.ndarray) -> tuple[Sta
 def _measure_offsets(state: State, data: PoseData, residuals: np.ndarray) -> np.ndarray:
     """Return the offset (p, f, 2) mm of each feature on the board by each pose; 0 where missing or an outlier."""
     by_place = []
+    data = data._replace(sample_from=np.zeros_like(data.sample_from))  # the samples' predictions are not needed
     here, _ = predict_observations(state, data)
     for k in range(2):
         step = np.zeros_like(state.offsets)
