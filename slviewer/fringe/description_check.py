@@ -5,7 +5,8 @@ of the fringes, and the phase rises with the code; each fringe period predicts t
 inside the projector and are no mirror image of the scene.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -38,20 +39,64 @@ MIRRORED = 0.8
 """Share of mirrored pixels from which an axis is reversed; a smaller share is due to noise and depth steps."""
 
 
-def check_description(sequence: PatternSequence, stack: np.ndarray) -> tuple[Contradiction, ...]:
+@dataclass(frozen=True, eq=False)
+class FrameReadings:
+    """What the checks read in the (n, h, w) ``stack`` of a capture: computed when first used, and then cached."""
+
+    sequence: PatternSequence
+    stack: np.ndarray
+
+    @cached_property
+    def sample(self) -> LineSample:
+        """Rows and columns of the frames."""
+        return sample_lines(self.sequence, self.stack)
+
+    @cached_property
+    def readers(self) -> dict[Axis, AxisReader]:
+        """The reader of each axis."""
+        return {axis: AxisReader(self.sample, coded_frames(self.sequence, axis)) for axis in self.sequence.axes}
+
+    @cached_property
+    def likeness(self) -> FrameLikeness:
+        """The comparison of the frames with each other."""
+        return FrameLikeness(self.sequence, self.sample)
+
+    @cached_property
+    def copies(self) -> tuple[Contradiction, ...]:
+        """Contradictions of frames that repeat others; empty if none do."""
+        return detect_copies(self.sequence, self.readers, self.likeness)
+
+    @cached_property
+    def stated(self) -> dict[Axis, Agreement]:
+        """How well the frames of each axis agree under the description."""
+        return {
+            axis: measure_agreement(reader, described_frames(self.sequence, axis))
+            for axis, reader in self.readers.items()
+        }
+
+    @cached_property
+    def mirroring(self) -> tuple[Contradiction, ...]:
+        """The contradiction of axes that are exchanged or reversed; empty if the coordinates are not mirrored."""
+        return _detect_mirroring(self.sequence, self.sample)
+
+
+def check_description(
+    sequence: PatternSequence, stack: np.ndarray, readings: FrameReadings | None = None
+) -> tuple[Contradiction, ...]:
     """Return the contradictions between the description of an (n, h, w) stack and its frames, the most probable first.
 
     The result is empty where the description holds. Some rows and columns are read, weighted by modulation; frames of
-    unequal light are compared as they would be under equal light. Raises InputError for a stack that does not match the
-    sequence.
+    unequal light are compared as they would be under equal light. ``readings``: of the stack, new ones if None. Raises
+    InputError for a stack that does not match the sequence.
     """
     check_stack(sequence, stack)
-    contradictions = find_contradictions(sequence, stack)
+    readings = readings or FrameReadings(sequence, stack)
+    contradictions = find_contradictions(readings)
     if not contradictions:
         return ()
     light = estimate_frame_light(sequence, stack)
     if light.is_significant:
-        under_equal_light = find_contradictions(sequence, equalize_frames(stack, light, sequence)[0])
+        under_equal_light = find_contradictions(FrameReadings(sequence, equalize_frames(stack, light, sequence)[0]))
         is_explained = all(contradiction.cause != "unreadable" for contradiction in contradictions)
         # Misplaced frames distort the estimate of the light: an explanation of the frames as they are has priority.
         if not under_equal_light or not is_explained:
@@ -60,7 +105,7 @@ def check_description(sequence: PatternSequence, stack: np.ndarray) -> tuple[Con
         return contradictions
     if not contradictions:
         return ()
-    sample = sample_lines(sequence, stack)
+    sample = readings.sample
     coded = coded_frames(sequence)
     illuminated = sample.swing(coded) > sample.least_swing
     clipped = np.array([float(np.mean(sample.frames[i][illuminated] >= sample.white)) for i in coded])
@@ -108,30 +153,27 @@ def _measure_unsteadiness(sequence: PatternSequence, sample: LineSample, illumin
     return worst
 
 
-def find_contradictions(
-    sequence: PatternSequence, stack: np.ndarray, *, with_steps: bool = True
-) -> tuple[Contradiction, ...]:  # fmt: skip
+def find_contradictions(readings: FrameReadings, *, with_steps: bool = True) -> tuple[Contradiction, ...]:
     """Return the contradictions of frames as they are, assuming equal light; see `check_description`.
 
     ``with_steps``: also check the order of the phase steps within each period.
     """
+    sequence = readings.sequence
     if not sequence.axes:
         return ()
-    sample = sample_lines(sequence, stack)
-    readers = {axis: AxisReader(sample, coded_frames(sequence, axis)) for axis in sequence.axes}
+    sample = readings.sample
     if dark := _detect_missing_pattern(sequence, sample):
         return dark
-    likeness = FrameLikeness(sequence, sample)
-    if repeated := detect_copies(sequence, readers, likeness):
-        return repeated
-    stated = {axis: measure_agreement(readers[axis], described_frames(sequence, axis)) for axis in sequence.axes}
+    if readings.copies:
+        return readings.copies
+    readers, likeness, stated = readings.readers, readings.likeness, readings.stated
     failed = {axis: failed_tests(described_frames(sequence, axis), stated[axis]) for axis in sequence.axes}
     steps = StepReader(sequence, sample)
     disordered = [c for axis in sequence.axes if with_steps for c in steps.detect_misplaced_steps(axis)]
     strange = steps.detect_unexplained_steps() if with_steps and not disordered else set()
-    uneven = [i for i in range(len(stack)) if not likeness.is_even(i, i)]
+    uneven = [i for i in range(len(readings.stack)) if not likeness.is_even(i, i)]
     if not any(failed.values()) and not disordered and not strange and not uneven:
-        return _detect_mirroring(sequence, sample)
+        return readings.mirroring
     if disordered and all(contradiction.cause in _OF_STEPS for contradiction in disordered):
         return tuple(disordered)  # steps of one period, which are explained completely
     if exchanged := _detect_exchanged_axes(sequence, sample, failed):

@@ -16,7 +16,7 @@ import numpy as np
 from slviewer.errors import InputError
 from slviewer.fringe.aliased_harmonics import describe_gamma, estimate_aliased_harmonics
 from slviewer.fringe.contradiction import Contradiction
-from slviewer.fringe.description_check import find_contradictions
+from slviewer.fringe.description_check import FrameReadings, find_contradictions
 from slviewer.fringe.frame_light import CLIPPED, FrameLight, detect_light_faults, equalize_frames, estimate_frame_light
 from slviewer.fringe.layout import Layout, axis_layout, white_level
 from slviewer.fringe.noise import measure_noise
@@ -66,12 +66,19 @@ def frame_residuals(sequence: PatternSequence, stack: np.ndarray, axis: Axis) ->
     About 60,000 pixels of evenly spread rows are sampled. Gamma raises `sigmas` of all frames alike; only a frame that
     contradicts the others is a suspect.
     """
-    return _measure_axis_residuals(_Frames(sequence, stack, estimate_frame_light(sequence, stack)), axis)
+    light = estimate_frame_light(sequence, stack)
+    return _measure_axis_residuals(_Frames(FrameReadings(sequence, stack), light), axis)
 
 
-def capture_residuals(sequence: PatternSequence, stack: np.ndarray) -> list[FrameResiduals]:
-    """Return `frame_residuals` of each axis of a capture (n, h, w); an axis that cannot be decoded is skipped."""
-    frames = _Frames(sequence, stack, estimate_frame_light(sequence, stack))
+def capture_residuals(
+    sequence: PatternSequence, stack: np.ndarray, readings: FrameReadings | None = None
+) -> list[FrameResiduals]:
+    """Return `frame_residuals` of each axis of a capture (n, h, w); an axis that cannot be decoded is skipped.
+
+    ``readings``: of the stack, new ones if None.
+    """
+    light = estimate_frame_light(sequence, stack)
+    frames = _Frames(readings or FrameReadings(sequence, stack), light)
     residuals = []
     for axis in sequence.axes:
         with suppress(InputError):  # decoding reports it, with the remedy
@@ -83,21 +90,30 @@ def capture_residuals(sequence: PatternSequence, stack: np.ndarray) -> list[Fram
 class _Frames:
     """Frames of a capture, their grey levels multiplied by ``factor``, and cached results that all axes share."""
 
-    sequence: PatternSequence
-    stack: np.ndarray
+    readings: FrameReadings
     light: FrameLight
     factor: float = 1.0
+
+    @property
+    def sequence(self) -> PatternSequence:
+        """The description of the frames."""
+        return self.readings.sequence
+
+    @property
+    def stack(self) -> np.ndarray:
+        """The frames (n, h, w)."""
+        return self.readings.stack
 
     @cached_property
     def equalized(self) -> "_Frames":
         """The frames scaled to equal light."""
         stack, factor = equalize_frames(self.stack, self.light, self.sequence)
-        return _Frames(self.sequence, stack, self.light, factor)
+        return _Frames(FrameReadings(self.sequence, stack), self.light, factor)
 
     @cached_property
     def contradictions(self) -> tuple[Contradiction, ...]:
         """Contradictions between the frames and their description, except for those of the phase steps."""
-        return find_contradictions(self.sequence, self.stack, with_steps=False)
+        return find_contradictions(self.readings, with_steps=False)
 
     def white(self, axis: Axis) -> float:
         """Return the grey level at which the frames of an axis are clipped."""

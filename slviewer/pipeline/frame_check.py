@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from slviewer.fringe.contradiction import Contradiction
-from slviewer.fringe.description_check import check_description
+from slviewer.fringe.description_check import FrameReadings, check_description
 from slviewer.fringe.residual import FrameResidual, FrameResiduals, capture_residuals
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.fringe.suspect import Suspect
@@ -70,7 +70,9 @@ _FIGURES = tuple(name for name in FrameResidual.__annotations__ if name != "fram
 
 def check_frames(sequence: PatternSequence, stack: np.ndarray) -> FrameCheck:
     """Check the frames (n, h, w) of a capture."""
-    return FrameCheck(tuple(capture_residuals(sequence, stack)), check_description(sequence, stack))
+    readings = FrameReadings(sequence, stack)
+    residuals = capture_residuals(sequence, stack, readings)
+    return FrameCheck(tuple(residuals), check_description(sequence, stack, readings))
 
 
 def save_check(session: Session, capture: Capture, frames: np.ndarray | None = None) -> FrameCheck:

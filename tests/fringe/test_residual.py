@@ -10,6 +10,7 @@ from fringe_scene import capture, slope
 
 from slviewer.fringe.presets import complementary, gray, gray_bits, multifrequency, p18, phase_steps
 from slviewer.fringe.residual import frame_residuals
+from slviewer.fringe.residual_sample import estimate_roughness
 from slviewer.fringe.sequence import Frame, PatternSequence
 from slviewer.session.importers import procam_calibration
 from slviewer.simulation.boards import Pose, blank_board
@@ -192,6 +193,14 @@ def test_twelve_bits_in_sixteen():
     stack = capture(sequence, COORDINATE).astype(np.uint16) * 16
     assert told(sequence, stack) == {}
     assert told(sequence, late(stack, 3)) == {3: "late"}
+
+
+@pytest.mark.parametrize("width", [63, 64])
+@pytest.mark.parametrize("highest", [255, 65535])
+def test_roughness_is_the_median_of_third_differences(width: int, highest: int):
+    frames = np.random.default_rng(0).integers(0, highest, (3, 5, width)).astype(np.float32)
+    median = np.median(np.abs(np.diff(frames, n=3, axis=-1)))
+    assert estimate_roughness(frames.reshape(3, -1), width) == median / (0.6745 * np.sqrt(20))
 
 
 def test_photographed_captures(real_data: Path):
