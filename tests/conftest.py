@@ -17,6 +17,7 @@ from chromium import launched
 from filelock import FileLock
 from playwright.sync_api import Browser, sync_playwright
 
+os.environ["SLVIEWER_NO_PREPARATION"] = "1"  # wizards that tests start compile what they use, and nothing beside it
 sys.dont_write_bytecode = False  # what tests start as processes need not compile the sources again
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 

@@ -23,6 +23,8 @@ from slviewer.wizard.operator import Operator
 
 SCALE = 0.2
 """Of the rig's resolution: small, and every step still succeeds."""
+SWITCHED_OFF = "SLVIEWER_NO_PREPARATION"
+"""Environment variable that, set to anything, prevents the process."""
 COMMAND = [sys.executable, "-m", "slviewer.wizard.preparation"]
 _ACTS = 32  # of an autopilot with eight poses
 
@@ -50,7 +52,7 @@ class Preparation:
     def _run(self) -> None:
         """Start the process, follow its progress, and note when it has ended well."""
         done = prepared_file()
-        if done is None or done.exists():
+        if done is None or done.exists() or os.environ.get(SWITCHED_OFF):
             return
         environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
         pipe = subprocess.PIPE

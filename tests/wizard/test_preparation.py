@@ -2,7 +2,6 @@
 
 import subprocess
 import sys
-import threading
 from pathlib import Path
 
 import pytest
@@ -17,6 +16,7 @@ SCRIPT = "import sys; print(0.0); print(0.5, flush=True); sys.exit({status})"
 def done(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The file that says that everything is compiled, which is not there yet."""
     monkeypatch.setattr(preparation, "cache_root", lambda: tmp_path)
+    monkeypatch.delenv(preparation.SWITCHED_OFF)
     file = prepared_file()
     assert file is not None and not file.exists()
     return file
@@ -26,17 +26,9 @@ def prepare(status: int, monkeypatch: pytest.MonkeyPatch) -> list[float | None]:
     """What is reported by a process that ends with this status."""
     monkeypatch.setattr(preparation, "COMMAND", [sys.executable, "-c", SCRIPT.format(status=status)])
     reports: list[float | None] = []
-    ended = threading.Event()
-
-    def report(share: float | None) -> None:
-        reports.append(share)
-        if share is None:
-            ended.set()
-
-    preparation_process = Preparation(report)
+    preparation_process = Preparation(reports.append)
     preparation_process.start()
-    if not ended.wait(0.5 if prepared_file().exists() else 30):  # type: ignore[union-attr]
-        preparation_process.close()
+    preparation_process._thread.join(30)
     return reports
 
 
@@ -48,6 +40,12 @@ def test_progress_is_reported_and_the_next_start_compiles_nothing(done: Path, mo
 
 def test_what_failed_is_tried_again_at_the_next_start(done: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert prepare(1, monkeypatch) == [0.0, 0.5, None]
+    assert not done.exists()
+
+
+def test_an_environment_variable_switches_it_off(done: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(preparation.SWITCHED_OFF, "1")
+    assert prepare(0, monkeypatch) == []
     assert not done.exists()
 
 
