@@ -26,7 +26,7 @@ from slviewer.pipeline.models import (
 )
 from slviewer.pipeline.open_session import SessionLike, opened
 from slviewer.pipeline.scale import describe_scale
-from slviewer.reconstruction.cloud import Cloud
+from slviewer.reconstruction.cloud import Cloud, choose_pixels
 from slviewer.reconstruction.mesh import triangulate_grid
 from slviewer.reconstruction.reconstruct import JUMP
 from slviewer.session.capture import Capture
@@ -155,7 +155,9 @@ def reconstruct(
         ply.parent.mkdir(parents=True, exist_ok=True)
         faces = triangulate_points(cloud.points, mask) if mesh else None
         notes = (f"scan {capture}, frame: {frame_of(store, name)}", f"calibration {name}")
-        write_ply(ply, cloud.points[mask], texture[mask], scalars=cloud.sigmas(mask), faces=faces, notes=notes)
+        write_ply(
+            ply, choose_pixels(cloud.points, mask), texture[mask], scalars=cloud.sigmas(mask), faces=faces, notes=notes
+        )
         if grid is not None:
             write_grid(Path(grid), cloud.points)
         scale, fitted, frame = describe_scale(store, name), chosen[name], frame_of(store, name)

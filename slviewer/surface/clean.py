@@ -9,7 +9,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from slviewer.geometry.cubes import occupied_cubes
-from slviewer.reconstruction.cloud import Cloud
+from slviewer.reconstruction.cloud import Cloud, choose_pixels
 
 STEEPEST = 6.0
 """Largest depth step between neighbours of one surface, over their distance across the viewing direction (80°)."""
@@ -95,7 +95,7 @@ def detect_jumps(points: np.ndarray, sigma_z: np.ndarray) -> np.ndarray:
 def detect_far_clusters(points: np.ndarray, mask: np.ndarray) -> np.ndarray:
     """(h, w) bool: of the points (h, w, 3) mm in a ``mask`` (h, w), those in small clusters far from all others."""
     far = np.zeros(mask.shape, bool)
-    chosen = points[mask].astype(np.float64)
+    chosen = choose_pixels(points, mask).astype(np.float64)
     if len(chosen) < 2:
         return far
     subset = chosen[:: max(1, len(chosen) // 5000)]

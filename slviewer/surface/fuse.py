@@ -14,7 +14,7 @@ import numpy as np
 
 from slviewer.errors import InputError
 from slviewer.geometry.rigid import move_points
-from slviewer.reconstruction.cloud import Cloud
+from slviewer.reconstruction.cloud import Cloud, choose_pixels
 from slviewer.surface.agreement import SurfaceAgreement, colour_gains, compare_views
 from slviewer.surface.clean import viewing_cosines
 from slviewer.surface.overlap_kernels import FIELDS, add_surface, count_votes
@@ -100,7 +100,7 @@ def _detect_violations(
     for i, (name, view) in enumerate(views.items()):
         progress(i / len(views))
         mask = view.mask
-        points = view.points[mask]
+        points = choose_pixels(view.points, mask)
         confirming, contradicting = np.zeros(len(points), np.int16), np.zeros(len(points), np.int16)
         for other, there in views.items():
             if other != name:
@@ -142,7 +142,7 @@ def _fuse_scan(
     """
     view, order = views[name], list(views)
     mask = view.mask
-    points, normals = view.points[mask], view.normals[mask]
+    points, normals = (choose_pixels(values, mask) for values in (view.points, view.normals))
     noise, lasting, inner = view.noise[mask], view.lasting[mask], view.inner[mask]
     R = view.T[:3, :3]
     weight = inner / (noise.astype(np.float64) ** 2 + lasting.astype(np.float64) ** 2)
