@@ -188,7 +188,7 @@ def _render(title: str, subtitle: str, headlines: Sequence[Headline], sections: 
         subtitle=subtitle,
         headlines=headlines,
         sections=sections,
-        style=Markup((here / "page.css").read_text(encoding="utf-8")),  # ours, not a user's
+        style=Markup((here / "page.css").read_text(encoding="utf-8")),  # noqa: S704, ours, not a user's
         version=__version__,
         written=datetime.now().strftime("%Y-%m-%d %H:%M"),
     )
