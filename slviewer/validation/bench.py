@@ -99,7 +99,7 @@ def bench(
     Args:
         calibration: Also simulate and calibrate 25 poses (minutes, and 3.5 GB of disk at full size).
         live: Also scan live, at half the resolution, with one viewer that draws and one that stalls.
-        wizard: Time instead what an operator waits for, at half the resolution, beside its targets.
+        wizard: Time instead (ten minutes) what an operator waits for, at half the resolution, beside its targets.
         scaling: Time instead (minutes) how the work grows with pixels, target poses, scans and captures.
         minutes: How long to scan live.
         scale: Resolution of the camera, as a share of 1600x1200.

@@ -37,7 +37,7 @@ LIMITS = {
     "`slviewer reproduce --quick` again": 30.0,
 }
 """Seconds that a person may have to wait, at 800x600 on two cores. After installation no kernel is compiled yet."""
-_SAMPLING_S = 0.01
+_SAMPLING_S = 0.02
 _FUNCTIONS = 8
 """Shown of the slowest act."""
 
@@ -116,11 +116,16 @@ class _Sampler:
                 if thread == self._thread.ident or frame.f_code.co_filename.endswith(_WAITING):
                     continue
                 inner: Any = frame
-                while inner is not None and "slviewer" not in inner.f_globals.get("__name__", ""):
+                while inner is not None and not _is_counted(inner.f_globals.get("__name__", "")):
                     inner = inner.f_back
                 if inner is not None:
                     name = f"{inner.f_globals['__name__']}.{inner.f_code.co_qualname}".replace(".<locals>", "")
                     self.samples.setdefault(self.act, Counter())[name] += 1
+
+
+def _is_counted(module: str) -> bool:
+    """Whether samples are counted for a module's functions: the package's, but for the wrapper of every kernel."""
+    return module.startswith("slviewer.") and module != "slviewer.geometry.jit"
 
 
 _WAITING = ("threading.py", "selectors.py", "socket.py", "queue.py", "subprocess.py")

@@ -1,12 +1,14 @@
 """Waiting times of an operator, from the snapshots that a wizard publishes."""
 
+import threading
 import time
+from collections import Counter
 from types import SimpleNamespace
 
 import pytest
 
 from slviewer.validation import bench_wizard
-from slviewer.validation.bench_wizard import _Stopwatch
+from slviewer.validation.bench_wizard import _Sampler, _Stopwatch
 
 
 def test_waiting_begins_with_the_last_frame(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -41,3 +43,24 @@ def test_waiting_begins_with_the_last_frame(monkeypatch: pytest.MonkeyPatch) -> 
         "verify a plane or a sphere with all models": [2.0],
     }
     assert set(found) <= set(bench_wizard.LIMITS)
+
+
+def test_the_functions_of_an_act_are_sampled(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bench_wizard, "_is_counted", lambda module: module == __name__)
+    done = threading.Event()
+
+    def work() -> None:
+        while not done.is_set():
+            sum(range(1000))
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    with _Sampler() as sampler:
+        sampler.act = "working"
+        deadline = time.monotonic() + 60.0
+        while sampler.samples.get("working", Counter()).total() < 3 and time.monotonic() < deadline:
+            time.sleep(0.01)
+    done.set()
+    thread.join()
+    assert any("work" in name for name in sampler.samples["working"])
+    assert sampler.act == "working"
