@@ -28,6 +28,10 @@ class SessionError(SlviewerError):
     """A session folder that cannot be read or written."""
 
 
+class DamagedError(SessionError):
+    """A stored capture or result that is not what was saved: a file of it is missing, cut short or altered."""
+
+
 class DeviceError(SlviewerError):
     """A camera or projector that does not answer, was unplugged, or cannot do what was requested."""
 

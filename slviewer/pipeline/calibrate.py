@@ -154,7 +154,10 @@ def calibrate(
     with opened(session, write=True) as store:
         excluded = store.excluded()
         before = preferred_model(store) if available_models(store) else ""
-        names = store.capture_names("calibration")
+        captures, faults = store.read_captures()
+        for fault in faults.values():
+            warn(f"not used: {fault}")
+        names = [capture.name for capture in captures if capture.role == "calibration"]
         if not names:
             raise InputError(
                 f"{store.folder} holds no target poses: import some with --role calibration, or capture them first"

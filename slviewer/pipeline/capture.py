@@ -66,7 +66,7 @@ def capture(
     target = None if board is None else Board.parse(board)
     safe_name(name)
     with opened_or_made(session) as store:
-        if name in store.capture_names() and not force:
+        if name in store.taken_names() and not force:
             raise InputError(f"there is a capture {name!r} already: choose another name, or replace it with --force")
         choice = rig if isinstance(rig, Mapping) else load_rig(rig, store)
         target = target or (Board.parse(known) if (known := store.decision("target")) else None)

@@ -1,7 +1,7 @@
 """From a stored capture to phase maps and a texture."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 
 import cv2
 import numpy as np
@@ -184,20 +184,24 @@ def decode_captures(
     ``warn`` is called with frames that contradict the others, and with the reasons why many pixels are masked;
     ``relative`` as in `decode_capture`. ``check``: compare the frames of captures that have no saved comparison.
     """
-    captures = [session.load_capture(name) for name in names]
-    if not captures:
-        return
+    for capture, reading in read_ahead([session.load_capture(name) for name in names]):
+        frames = reading.result()
+        phases = decode_capture(capture, frames, relative=relative)
+        if warn is not ignore_warnings:
+            compared = load_or_save_check(session, capture, frames) if check else load_check(session, capture.name)
+            for message in compared.warnings() if compared else ():
+                warn(f"{capture.name}: {message}")
+            for message in loss_warnings(capture.sequence, frames, phases):
+                warn(f"{capture.name}: {message}")
+        yield capture, frames, phases
+
+
+def read_ahead(captures: Sequence[Capture]) -> Iterator[tuple[Capture, Future[np.ndarray]]]:
+    """Yield captures with their frames, whose `result()` may raise; the next one's are read while one is processed."""
     with ThreadPoolExecutor(1) as reader:
-        ahead = reader.submit(captures[0].stack)
+        ahead = [reader.submit(capture.stack) for capture in captures[:1]]
         for i, capture in enumerate(captures):
-            frames = ahead.result()
-            if i + 1 < len(captures):
-                ahead = reader.submit(captures[i + 1].stack)
-            phases = decode_capture(capture, frames, relative=relative)
-            if warn is not ignore_warnings:
-                compared = load_or_save_check(session, capture, frames) if check else load_check(session, capture.name)
-                for message in compared.warnings() if compared else ():
-                    warn(f"{capture.name}: {message}")
-                for message in loss_warnings(capture.sequence, frames, phases):
-                    warn(f"{capture.name}: {message}")
-            yield capture, frames, phases
+            frames = ahead.pop()
+            wait([frames])
+            ahead += [reader.submit(following.stack) for following in captures[i + 1 : i + 2]]
+            yield capture, frames

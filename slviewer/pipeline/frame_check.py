@@ -91,8 +91,5 @@ def load_or_save_check(session: Session, capture: Capture, frames: np.ndarray | 
 
 def load_check(session: Session, name: str) -> FrameCheck | None:
     """The saved check of a capture; None where it is missing, of other frames or of another version."""
-    result = f"trust/{name}"
-    if session.state_of(result) != "fresh":
-        return None
-    meta = session.load_result(result)[0]
-    return FrameCheck.from_json(meta) if meta.get("version") == VERSION else None
+    saved = session.load_fresh(f"trust/{name}")
+    return FrameCheck.from_json(saved[0]) if saved and saved[0].get("version") == VERSION else None

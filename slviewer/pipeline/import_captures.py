@@ -1,7 +1,8 @@
 """Bringing captures that other tools made into a session.
 
 Of a folder of captures, those that can be read and decoded are saved in one step, and a warning names each other with
-its reason; with `strict`, one fault refuses the folder.
+its reason; with `strict`, one fault refuses the folder. Those that the session has already, with the same content, are
+skipped: an import that was interrupted continues when it is repeated.
 """
 
 from collections.abc import Iterator
@@ -16,7 +17,7 @@ from slviewer.fringe.sequence import PerAxis, parse_size
 from slviewer.pipeline.capture_phases import check_capture, decode_frames
 from slviewer.pipeline.exposure_check import check_capture_exposure
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
-from slviewer.pipeline.frame_check import save_check
+from slviewer.pipeline.frame_check import load_or_save_check
 from slviewer.pipeline.models import available_models
 from slviewer.pipeline.open_session import SessionLike, opened, opened_or_made
 from slviewer.session.capture import NewCapture
@@ -66,7 +67,8 @@ def import_captures(
     recorded as where the captures come from, by default their folders. ``options`` are those of the layout's `read`.
 
     Captures that cannot be read or decoded are skipped, and ``warn`` is called with the reason. Raises InputError where
-    none is left, or, with ``strict``, for the first of them; nothing is saved then.
+    none is left, or, with ``strict``, for the first of them; nothing is saved then. Captures that are there already,
+    equal in every frame, stay as they are, with a warning; one whose stored frames are damaged is replaced.
     """
     imports = find_captures(
         source,
@@ -175,6 +177,9 @@ def _save_captures(
         raise InputError(str(skipped[0]))
 
     stated: set[str] = set()
+    names: list[str] = []
+    unchanged: list[str] = []
+    damaged: set[str] = set()
 
     def warn_once(message: str) -> None:
         """Issue a warning unless the same message was issued before."""
@@ -198,20 +203,31 @@ def _save_captures(
                 continue
             for message in _list_assumptions(recording, capture):
                 warn_once(message)
-            yield replace(capture, sequence=checked_capture.sequence, source=origin or capture.source)
+            names.append(capture.name)
+            capture = replace(capture, sequence=checked_capture.sequence, source=origin or capture.source)
+            comparison = store.compare_capture(capture, role)
+            if comparison == "same":
+                unchanged.append(capture.name)
+                continue
+            if comparison == "damaged":
+                warn(f"{capture.name}: its stored frames are damaged: the capture is replaced, and now in the trash")
+                damaged.add(capture.name)
+            yield capture
         if len(skipped) == len(imports.skipped) + len(imports.recordings):
             raise none_usable(skipped)
 
     with opened_or_made(session) as store:
-        saved = store.save_captures(read(), role, force=force)
+        store.save_captures(read(), role, force=force or damaged)
         for each in skipped:
             warn(f"not imported: {each}")
-        for capture in saved:
-            progress(1.0, f"looking at {capture.name}")
-            for sentence in save_check(store, capture).warnings():
-                warn(f"{capture.name}: {sentence}")
+        if unchanged:
+            warn(f"already in the session with the same content, and not imported again: {', '.join(unchanged)}")
+        for name in names:
+            progress(1.0, f"looking at {name}")
+            for sentence in load_or_save_check(store, store.load_capture(name)).warnings():
+                warn(f"{name}: {sentence}")
     progress(1.0, "imported")
-    return [capture.name for capture in saved]
+    return names
 
 
 def _known_projector_size(session: SessionLike) -> tuple[int, int] | None:

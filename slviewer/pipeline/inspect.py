@@ -1,51 +1,107 @@
-"""What a session holds, in words."""
+"""What a session holds, in words, and whether it is what was saved."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
 
+from slviewer.errors import DamagedError, SlviewerError
 from slviewer.pipeline.calibration_verdict import load_last_verdict
+from slviewer.pipeline.feedback import Progress, ignore_progress
 from slviewer.pipeline.measurements import describe_measurement, load_measurements
 from slviewer.pipeline.models import available_models, load_stereo, preferred_model
 from slviewer.pipeline.open_session import SessionLike, opened
 from slviewer.session.capture import Capture
+from slviewer.session.results import verify_result
+from slviewer.session.store import Session
 
 
-def inspect(session: SessionLike) -> str:
-    """List what a session holds, and what is stale.
+def inspect(session: SessionLike, *, check: bool = False, progress: Progress = ignore_progress) -> str:
+    """List what a session holds, and what is stale or damaged.
 
     Args:
         session: Session folder.
+        check: Read every capture and result, and compare it with the hash that it was saved with; ends with status 1
+            where anything is damaged.
     """
     with opened(session) as store:
-        excluded = store.excluded()
-        captures = store.captures()
+        if check:
+            return _check(store, progress)
+        captures, faults = store.read_captures()
+        damage = list(faults.values())
         lines = [f"{store.folder}: {len(captures)} capture{'s' * (len(captures) != 1)}"]
-        for capture in captures:
-            note = f"  [excluded: {excluded[capture.name]}]" if capture.name in excluded else ""
-            lines.append(f"  {summarise_capture(capture)}{note}")
-        for name in available_models(store):
-            state = store.state_of(f"calibration/{name}")
-            meta = store.load_result(f"calibration/{name}", only=())[0]
-            mark = ", the default" if name == preferred_model(store) else ""
-            made = f"imported from {meta['source']}" if "imported" in meta else f"from {len(meta['inputs'])} poses"
-            lines.append(f"calibration {name}: {made}, {state}{mark}")
-            if "imported" in meta:
-                lines += _describe_imported_calibration(meta)
-            elif name == "stereo":
-                rms = load_stereo(store).reprojection_rms_px
-                lines.append("  reprojection RMS " + ", ".join(f"{k} {v:.3f} px" for k, v in rms.items()))
-        verdict = load_last_verdict(store)
-        if verdict is not None:
-            lines.append(verdict.text())
-        measured = load_measurements(store)
-        if measured:
-            lines.append(f"{len(measured)} measurement{'s' * (len(measured) != 1)}:")
-            lines += [f"  {describe_measurement(each)}" for each in measured]
+        lines += [f"  {name} was complete, and not yet in its place: it is now" for name in store.recovered]
+        parts: list[Callable[[], Iterable[str]]] = [
+            partial(_describe_captures, store, captures),
+            *(partial(_describe_calibration, store, name) for name in available_models(store)),
+            partial(_describe_verdict, store),
+            partial(_describe_measurements, store),
+        ]
+        for part in parts:
+            try:
+                lines += part()
+            except SlviewerError as error:  # one damaged file hides nothing else
+                damage.append(str(error))
         if not available_models(store):
             lines.append("no calibration yet: run `slviewer calibrate` with the --target in use")
+        lines += [f"damaged: {fault}" for fault in dict.fromkeys(damage)]
     return "\n".join(lines)
+
+
+def _check(store: Session, progress: Progress) -> str:
+    """Read everything, and describe what was compared. Raises DamagedError that lists what is damaged, if anything."""
+    (captures, faults), results = store.read_captures(), store.result_names()
+    damage = list(faults.values())
+    checks: list[tuple[str, Callable[[], object]]] = [("the decisions", store.excluded)]
+    checks += [(capture.name, capture.verify) for capture in captures]
+    checks += [(name, partial(verify_result, store.folder / "results" / name)) for name in results]
+    for i, (name, verify) in enumerate(checks):
+        progress(i / len(checks), f"checking {name}")
+        try:
+            verify()
+        except SlviewerError as error:
+            damage.append(str(error))
+    progress(1.0, "checked")
+    counts = f"{len(captures)} captures and {len(results)} results"
+    if damage:
+        raise DamagedError("\n  ".join([f"{store.folder}: {counts} were read, and this is damaged:", *damage]))
+    return f"{store.folder}: {counts} are what was saved"
+
+
+def _describe_captures(store: Session, captures: Iterable[Capture]) -> list[str]:
+    """A line for each capture."""
+    excluded = store.excluded()
+    notes = {name: f"  [excluded: {why}]" for name, why in excluded.items()}
+    return [f"  {summarise_capture(capture)}{notes.get(capture.name, '')}" for capture in captures]
+
+
+def _describe_calibration(store: Session, name: str) -> list[str]:
+    """One model of the session's calibration, by name: what it was made from, its state, its accuracy."""
+    state = store.state_of(f"calibration/{name}")
+    meta = store.load_result(f"calibration/{name}", only=())[0]
+    mark = ", the default" if name == preferred_model(store) else ""
+    made = f"imported from {meta['source']}" if "imported" in meta else f"from {len(meta['inputs'])} poses"
+    lines = [f"calibration {name}: {made}, {state}{mark}"]
+    if "imported" in meta:
+        lines += _describe_imported_calibration(meta)
+    elif name == "stereo":
+        rms = load_stereo(store).reprojection_rms_px
+        lines.append("  reprojection RMS " + ", ".join(f"{k} {v:.3f} px" for k, v in rms.items()))
+    return lines
+
+
+def _describe_verdict(store: Session) -> list[str]:
+    """The verdict on the last attempt to calibrate, where there was one."""
+    verdict = load_last_verdict(store)
+    return [] if verdict is None else [verdict.text()]
+
+
+def _describe_measurements(store: Session) -> list[str]:
+    """The measurements, a line each."""
+    measured = load_measurements(store)
+    heading = f"{len(measured)} measurement{'s' * (len(measured) != 1)}:"
+    return [heading, *(f"  {describe_measurement(each)}" for each in measured)] if measured else []
 
 
 def _describe_imported_calibration(meta: Mapping[str, Any]) -> list[str]:

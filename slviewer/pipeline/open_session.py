@@ -1,6 +1,5 @@
 """A session by its folder, or one that is open already, and names in it."""
 
-import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from fnmatch import fnmatchcase
@@ -8,7 +7,7 @@ from pathlib import Path
 
 from slviewer.errors import SlviewerError, UsageError
 from slviewer.session.names import natural_key
-from slviewer.session.store import Session, is_session
+from slviewer.session.store import Session
 
 SessionLike = Path | str | Session
 
@@ -30,19 +29,12 @@ def opened_or_made(session: SessionLike) -> Iterator[Session]:
     if isinstance(session, Session):
         yield session
         return
-    folder = Path(session).expanduser().absolute()
-    fresh, parent_fresh = not is_session(folder), not folder.exists()
-    store = Session.open_or_create(folder)
-    try:
-        with store:
+    with Session.open_or_create(session) as store:
+        try:
             yield store
-    except BaseException:
-        if fresh and not store.capture_names():
-            for entry in folder.iterdir():
-                shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
-            if parent_fresh:
-                folder.rmdir()
-        raise
+        except BaseException:
+            store.remove_if_new()
+            raise
 
 
 def match_names(

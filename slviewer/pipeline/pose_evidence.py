@@ -66,10 +66,7 @@ def save_evidence(store: Session, capture: Capture, board: Board, evidence: Pose
 
 def load_evidence(store: Session, name: str, board: Board) -> PoseEvidence | None:
     """Load the stored evidence of a pose; None where it is missing, or of other frames or another board."""
-    result = f"evidence/{name}"
-    if store.state_of(result) != "fresh":
+    saved = store.load_fresh(f"evidence/{name}", only=())
+    if saved is None or (saved[0]["target"], saved[0].get("look")) != (str(board), EVIDENCE_VERSION):
         return None
-    meta = store.load_result(result, only=())[0]
-    if (meta["target"], meta.get("look")) != (str(board), EVIDENCE_VERSION):
-        return None
-    return PoseEvidence.from_json(meta["evidence"])
+    return PoseEvidence.from_json(saved[0]["evidence"])

@@ -8,10 +8,10 @@ import numpy as np
 
 from slviewer.calibration.diagnosis.evidence import PoseEvidence
 from slviewer.calibration.observe import READING_VERSION, Observation, Smoothing, observe
-from slviewer.errors import InputError
+from slviewer.errors import DamagedError, InputError
 from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis, PatternSequence
-from slviewer.pipeline.capture_phases import capture_texture, check_capture, decode_captures
+from slviewer.pipeline.capture_phases import capture_texture, check_capture, decode_capture, read_ahead
 from slviewer.pipeline.frame_check import FrameCheck, check_frames, load_or_save_check
 from slviewer.pipeline.pose_evidence import gather_evidence as examine_frames
 from slviewer.pipeline.pose_evidence import load_evidence, save_evidence
@@ -104,10 +104,10 @@ def read_stored_pose(
 
 def load_judged(store: Session, name: str, board: Board, smoothing: Smoothing) -> Judged | None:
     """Load the stored reading of a pose; None where it is of other frames, another board or another smoothing."""
-    result = f"poses/{name}"
-    if store.state_of(result) != "fresh":
+    saved = store.load_fresh(f"poses/{name}")
+    if saved is None:
         return None
-    meta = store.load_result(result, only=())[0]
+    meta, arrays = saved
     if (meta["target"], meta["smoothing"], meta.get("reading")) != (
         str(board),
         _list_settings(smoothing),
@@ -116,7 +116,7 @@ def load_judged(store: Session, name: str, board: Board, smoothing: Smoothing) -
         return None
     if meta["refused"]:
         return Judged(name, None, meta["refused"])
-    return Judged(name, Observation.from_arrays(name, store.load_result(result)[1]))
+    return Judged(name, Observation.from_arrays(name, arrays))
 
 
 def read_stored_poses(
@@ -127,7 +127,7 @@ def read_stored_poses(
     examine: bool = False,
     observed: Callable[[Observation], None] = lambda observation: None,
 ) -> Iterator[Judged]:
-    """Yield every pose in order; frames are read only where no stored result is valid.
+    """Yield every pose in order; frames are read only where no stored result is valid. Damaged frames refuse the pose.
 
     ``examine``: each with the evidence of its frames; ``observed`` as in ``read_pose``. Raises InputError
     where poses come from cameras or projectors of different size.
@@ -146,9 +146,18 @@ def read_stored_poses(
         for name, judged in cached.items():
             evidence = load_evidence(store, name, board)
             cached[name] = replace(judged, evidence=evidence) if judged and evidence else None
-    decoded = decode_captures(store, [name for name in names if cached[name] is None])
+    ahead = read_ahead([capture for capture in captures if cached[capture.name] is None])
     for name in names:
-        yield cached[name] or read_stored_pose(store, *next(decoded), board, smoothing, examine, observed)
+        judged = cached[name]
+        if judged is None:
+            capture, frames = next(ahead)
+            try:
+                phases = decode_capture(capture, frames.result())
+                judged = read_stored_pose(store, capture, frames.result(), phases, board, smoothing, examine, observed)
+            except DamagedError as error:
+                judged = Judged(name, None, str(error).removeprefix(f"{name}: "))
+            del frames  # before the next are waited for
+        yield judged
 
 
 def load_observations(store: Session, names: Sequence[str]) -> list[Observation]:

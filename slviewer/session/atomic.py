@@ -2,7 +2,9 @@
 
 A folder is written as `.<name>.tmp-<pid>-<random>` next to its place, every file synced, then renamed in. Where it
 replaces another it is first renamed to `.<name>.new-<pid>-<random>`: from then on the replacement is decided, and
-`recover` finishes it if the program dies between moving the old folder away and moving the new one in.
+`recover` finishes it if the program dies between moving the old folder away and moving the new one in. A folder that
+waits for others to be renamed with it is called `.<name>.done-<pid>-<random>`: it is complete, and `recover` renames it
+too.
 """
 
 import errno
@@ -11,15 +13,15 @@ import os
 import re
 import secrets
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from slviewer.errors import SessionError
+from slviewer.errors import DamagedError, SessionError
 from slviewer.records import to_plain
 
-_LEFTOVER = re.compile(r"\.(?P<name>.+)\.(?P<state>tmp|new)-\d+-[0-9a-f]+")
+_LEFTOVER = re.compile(r"\.(?P<name>.+)\.(?P<state>tmp|done|new)-\d+-[0-9a-f]+")
 _SPARE_BYTES = 1 << 20  # metadata, folders, the file system's own rounding
 
 
@@ -52,15 +54,15 @@ def to_json(data: Any) -> bytes:
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """The object in a JSON file; SessionError where the file is damaged or holds no object."""
+    """The object in a JSON file; DamagedError where the file is damaged or holds no object."""
     try:
         data = json.loads(path.read_bytes())
     except (ValueError, OSError) as error:
-        raise SessionError(
+        raise DamagedError(
             f"{path} cannot be read ({error}): restore it from a copy, or move its folder away"
         ) from error
     if not isinstance(data, dict):
-        raise SessionError(f"{path} holds no JSON object: restore it from a copy, or move its folder away")
+        raise DamagedError(f"{path} holds no JSON object: restore it from a copy, or move its folder away")
     return data
 
 
@@ -127,6 +129,16 @@ def staged_folder(target: Path, needs_bytes: int) -> Iterator[Path]:
             raise
 
 
+def mark_complete(folder: Path) -> Path:
+    """Rename a staged folder so that `recover` keeps it if the program dies before `commit`; returns its new path."""
+    match = _LEFTOVER.fullmatch(folder.name)
+    assert match is not None, folder
+    complete = _staging_path(folder.with_name(match["name"]), "done")
+    with _disk_errors(folder.parent):
+        os.rename(folder, complete)
+    return complete
+
+
 def commit(folder: Path, target: Path, old_to: Path | None = None) -> None:
     """Rename a staged folder to `target`. An existing one is moved to `old_to`, or deleted where that is None."""
     with _disk_errors(target.parent):
@@ -167,18 +179,30 @@ def list_leftovers(root: Path) -> list[Path]:
     return unfinished
 
 
-def recover(root: Path, trash: Path) -> None:
-    """Finish decided replacements and remove unfinished ones. Call with the session's lock held, nothing writing."""
+def recover(root: Path, trash_place: Callable[[Path], Path]) -> list[Path]:
+    """Finish what dead writers began: rename complete folders to their places, which are returned, and remove the rest.
+
+    Call with the session's lock held, nothing writing. A replacement that was decided moves the old folder to
+    `trash_place(target)`; a complete folder whose place is taken is itself moved there. Raises SessionError where the
+    disk refuses.
+    """
+    completed = []
     for path in list_leftovers(root):
         match = _LEFTOVER.fullmatch(path.name)
-        if match and match["state"] == "new":
-            target = path.with_name(match["name"])
+        if not match or match["state"] == "tmp":
+            discard(path)
+            continue
+        target = path.with_name(match["name"])
+        with _disk_errors(target.parent):
+            if target.exists() and match["state"] == "done":
+                move(path, trash_place(target))
+                continue
             if target.exists():
-                _move_away(target, trash / f"{target.name}-{secrets.token_hex(4)}")
+                move(target, trash_place(target))
             os.rename(path, target)
             sync_folder(target.parent)
-        else:
-            discard(path)
+        completed.append(target)
+    return completed
 
 
 def _move_away(target: Path, old_to: Path | None) -> None:

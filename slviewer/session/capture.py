@@ -11,13 +11,23 @@ from typing import Any, Literal
 
 import numpy as np
 
-from slviewer.errors import InputError, SessionError
+from slviewer.errors import DamagedError, InputError, SessionError
 from slviewer.fringe.hdr import choose_exposure, chosen, merge_exposures, peaks, pick
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.session.atomic import read_json, to_json, write_bytes, write_json
-from slviewer.session.stack import check_frames, describe_stack, read_stack, write_stack
+from slviewer.session.stack import (
+    check_frames,
+    describe_stack,
+    hash_frames,
+    hash_stack,
+    identify_stack,
+    read_stack,
+    write_stack,
+)
 
 Role = Literal["calibration", "scan"]
+Comparison = Literal["absent", "same", "damaged", "different"]
+"""Of a stored capture with a new one: "damaged" was the same when it was saved."""
 
 _FRAMES_IN_MEMORY = 8  # frames of an exposure that are in memory together while their peaks are computed
 
@@ -43,13 +53,25 @@ class Capture:
         """Frames (n, h, w) at `indices` into the sequence, in that order (all where None); reads only these.
 
         Those of a capture in several exposures are merged, pixel by pixel, by `exposure_choice`. Raises
-        SessionError where a frame is missing or damaged, or the capture was replaced since it was loaded.
+        DamagedError where a frame is not what was saved (of an older capture, whose frames have no checksums, only
+        where all are read), SessionError where the capture was replaced since it was loaded.
         """
         path = self.folder / "frames.zarr"
+        if (indices is None or self.exposures_ms) and (identity := identify_stack(path)) is not None:
+            _verify_once(self.folder, self.hash, identity)
         stack = self._merged(path, indices) if self.exposures_ms else read_stack(path, indices)
         if read_json(self.folder / "capture.json").get("hash") != self.hash:
             raise SessionError(f"capture {self.name!r} was replaced while it was in use: load it again")
         return stack
+
+    def verify(self) -> None:
+        """Read everything; raises DamagedError unless the frames and their description are those that were saved."""
+        described, exposures_ms = self.meta["sequence"], self.meta.get("exposures_ms")
+        if _hash_content(hash_stack(self.folder / "frames.zarr"), described, exposures_ms, self.texture) != self.hash:
+            raise DamagedError(
+                f"{self.name}: what {self.folder} holds is not what was saved (its hash differs): restore the folder "
+                "from a copy, or import or record the capture again"
+            )
 
     @property
     def exposures_ms(self) -> tuple[float, ...]:
@@ -86,7 +108,10 @@ class Capture:
 
         image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
         if image is None or image.shape != (self.size[1], self.size[0], 3):
-            raise SessionError(f"{path} is missing or damaged: import or record capture {self.name!r} again")
+            raise DamagedError(
+                f"{self.name}: its texture is damaged ({path} is missing or cannot be decoded): restore this file from "
+                "a copy, or import or record the capture again"
+            )
         return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
@@ -103,6 +128,12 @@ class NewCapture:
     source: str
     settings: Mapping[str, Any] = field(default_factory=dict)
     exposures_ms: Sequence[float] = ()
+
+    @property
+    def hash(self) -> str:
+        """The content hash that the capture will have once it is saved: of frames, exposures, texture, sequence."""
+        described, exposures_ms = self.sequence.to_dict(), list(self.exposures_ms)
+        return _hash_content(hash_frames(self.frames), described, exposures_ms, self.texture)
 
     @property
     def nbytes(self) -> int:
@@ -138,11 +169,7 @@ def write_capture(folder: Path, capture: NewCapture, role: Role, board: str | No
     frames, texture, exposures_ms = capture.frames, capture.texture, list(capture.exposures_ms)
     frames_hash = write_stack(folder / "frames.zarr", frames)
     described = capture.sequence.to_dict()
-    whole = hashlib.blake2b(frames_hash.encode() + to_json(described), digest_size=20)
-    if exposures_ms:
-        whole.update(to_json(exposures_ms))
     if texture is not None:
-        whole.update(np.ascontiguousarray(texture).data)
         write_bytes(folder / "texture.png", _encode_png(texture))
     write_json(
         folder / "capture.json",
@@ -154,7 +181,7 @@ def write_capture(folder: Path, capture: NewCapture, role: Role, board: str | No
             "camera": {"size": [frames.shape[2], frames.shape[1]], "dtype": str(frames.dtype)},
             "frames": len(frames),
             **({"exposures_ms": exposures_ms} if exposures_ms else {}),
-            "hash": whole.hexdigest(),
+            "hash": _hash_content(frames_hash, described, exposures_ms, texture),
             "texture": texture is not None,
             "settings": capture.settings,
             "sequence": described,
@@ -169,16 +196,53 @@ def read_capture(folder: Path) -> Capture:
         width, height = meta["camera"]["size"]
         role, sequence, content_hash = meta["role"], _read_sequence(json.dumps(meta["sequence"])), str(meta["hash"])
     except (KeyError, TypeError, ValueError, InputError) as error:
-        raise SessionError(
+        raise DamagedError(
             f"{folder / 'capture.json'} is damaged ({error!r}): move the folder away and import it again"
         ) from error
     return Capture(folder.name, role, sequence, (int(width), int(height)), content_hash, folder, meta)
+
+
+def compare_captures(folder: Path, new: NewCapture, role: Role) -> Comparison:
+    """How the capture stored in a folder compares with a new one, checked, for that role."""
+    if not folder.exists():
+        return "absent"
+    try:
+        saved = read_capture(folder)
+    except SessionError:
+        return "different"
+    if (saved.role, saved.hash) != (role, new.hash):
+        return "different"
+    try:
+        saved.verify()
+    except SessionError:
+        return "damaged"
+    return "same"
 
 
 @lru_cache(maxsize=16)
 def _read_sequence(text: str) -> PatternSequence:
     """Return the sequence that JSON describes; cached, as the captures of a session share a few."""
     return PatternSequence.from_dict(json.loads(text))
+
+
+def _hash_content(
+    frames_hash: str, described: Mapping[str, Any], exposures_ms: Sequence[float] | None, texture: np.ndarray | None
+) -> str:
+    """Return the content hash of a capture from that of its frames, its sequence as plain values, and the rest."""
+    whole = hashlib.blake2b(frames_hash.encode() + to_json(described), digest_size=20)
+    if exposures_ms:
+        whole.update(to_json(exposures_ms))
+    if texture is not None:
+        whole.update(np.ascontiguousarray(texture).data)
+    return whole.hexdigest()
+
+
+@lru_cache(maxsize=1024)
+def _verify_once(folder: Path, content_hash: str, identity: object) -> None:
+    """Verify a capture whose frames have no checksums, once a process while its files stay the same."""
+    capture = read_capture(folder)
+    if capture.hash == content_hash:  # else it is being replaced, which the reader of the frames reports
+        capture.verify()
 
 
 @lru_cache(maxsize=4)

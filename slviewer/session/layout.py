@@ -33,12 +33,13 @@ def session_folder(path: str | Path) -> Path:
     return folder
 
 
-def new_folder(path: str | Path) -> Path:
-    """A folder that a session may be made in, new or empty; SessionError otherwise."""
+def new_folder(path: str | Path) -> tuple[Path, bool]:
+    """A folder that a session may be made in, and whether it was made here, else empty; SessionError otherwise."""
     folder = _absolute_path(path)
     if is_session(folder):
         raise SessionError(f"{folder} is a session already: open it, or choose another folder")
     try:
+        existed = folder.exists()
         folder.mkdir(parents=True, exist_ok=True)
         strangers = [entry.name for entry in folder.iterdir() if not _is_leftover(entry)]
     except OSError as error:
@@ -47,7 +48,7 @@ def new_folder(path: str | Path) -> Path:
         raise SessionError(
             f"{folder} holds other things ({strangers[0]}): choose a new or an empty folder for the session"
         )
-    return folder
+    return folder, not existed
 
 
 def create_layout(folder: Path) -> None:
@@ -56,6 +57,25 @@ def create_layout(folder: Path) -> None:
         (folder / inner).mkdir(exist_ok=True)
     created = datetime.now(UTC).isoformat(timespec="seconds")
     replace_json(folder / "session.json", {"schema": SCHEMA, "created": created, "program": f"slviewer {__version__}"})
+
+
+def remove_layout(folder: Path) -> bool:
+    """Remove what `create_layout` made, and decisions; returns False, and removes nothing, where more was saved.
+
+    Call with the session's lock held: its files stay.
+    """
+    own = ("captures", "results", "exports", "trash")
+    inner = [folder / name for name in own if (folder / name).is_dir()]
+    files = {"session.json", "decisions.json", ".lock", ".lock-holder"}
+    if any(entry not in inner and entry.name not in files for entry in folder.iterdir()):
+        return False
+    if any(any(each.iterdir()) for each in inner):
+        return False
+    for each in inner:
+        each.rmdir()
+    for name in ("decisions.json", "session.json"):
+        (folder / name).unlink(missing_ok=True)
+    return True
 
 
 def inner_folders(folder: Path) -> list[str]:

@@ -1,5 +1,6 @@
 """One writer at a time: an exclusive lock on the session folder, and whose it is."""
 
+import contextlib
 import json
 import os
 import socket
@@ -37,6 +38,16 @@ class WriterLock:
         if self._lock.is_locked:
             self._holder.unlink(missing_ok=True)
             self._lock.release()
+
+    def release_and_remove(self) -> None:
+        """Remove the lock's files and release it: a writer that waits for it then begins with a new file.
+
+        Only for a folder that is no session any more.
+        """
+        self._holder.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # Windows removes no open file: an empty one stays
+            Path(self._lock.lock_file).unlink()
+        self._lock.release()
 
     @property
     def held(self) -> bool:

@@ -12,9 +12,14 @@ def safe_name(name: str) -> str:
 
     Raises InputError otherwise.
     """
-    if not isinstance(name, str) or not _SAFE.fullmatch(name) or name.endswith("."):
+    if not is_safe_name(name):
         raise InputError(f"{name!r} cannot be a name: use letters, digits, '_', '-' and '.', with no path in it")
     return name
+
+
+def is_safe_name(name: str) -> bool:
+    """Whether `safe_name` accepts the name."""
+    return isinstance(name, str) and _SAFE.fullmatch(name) is not None and not name.endswith(".")
 
 
 def safe_path(name: str) -> str:

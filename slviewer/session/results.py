@@ -1,4 +1,8 @@
-"""A result: what was computed, from which inputs, with which settings. `meta.json` and one `.npy` an array."""
+"""A result: what was computed, from which inputs, with which settings. `meta.json` and one `.npy` an array.
+
+`meta.json` holds the CRC-32C of the file of each array, which is checked when the array is read; older results have
+none, and only `verify_result` tells whether they are damaged.
+"""
 
 import hashlib
 import io
@@ -7,15 +11,16 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+import google_crc32c
 import numpy as np
 
-from slviewer.errors import InputError, SessionError
+from slviewer.errors import DamagedError, InputError
 from slviewer.session.atomic import read_json, to_json, write_bytes, write_json
 from slviewer.session.layout import inner_folders
 from slviewer.session.names import safe_path
 
 _ARRAY_FOLDER = "arrays"
-_RESERVED = {"hash", "arrays"}
+_RESERVED = {"hash", "arrays", "checksums"}
 
 
 def list_results(root: Path) -> list[str]:
@@ -51,45 +56,87 @@ def check_result(meta: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> d
 def write_result(folder: Path, meta: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> None:
     """Write a checked result into an empty folder, every file synced. Its hash covers meta and arrays."""
 
-    def write(name: str) -> bytes:
-        """Write one array as .npy, synced, and return its digest."""
+    def write(name: str) -> tuple[bytes, int]:
+        """Write one array as .npy, synced, and return digest and CRC-32C of the file."""
         array = np.asarray(arrays[name], order="C")
-        header = io.BytesIO()
-        np.lib.format.write_array_header_1_0(header, np.lib.format.header_data_from_array_1_0(array))
-        path = folder / _ARRAY_FOLDER / f"{name}.npy"
+        header, path = _make_header(array), _array_path(folder, name)
         path.parent.mkdir(parents=True, exist_ok=True)
         body = array.reshape(-1).view(np.uint8).data if array.size else b""
-        write_bytes(path, header.getvalue(), body)
-        whole = hashlib.blake2b(header.getvalue(), digest_size=20)
+        write_bytes(path, header, body)
+        whole = hashlib.blake2b(header, digest_size=20)
         whole.update(body)
-        return whole.digest()
+        return whole.digest(), _checksum(header, array)
 
     names = sorted(arrays)
     with ThreadPoolExecutor(4) as pool:
-        digests = list(pool.map(write, names))
-    whole = hashlib.blake2b(to_json(dict(meta)), digest_size=20)
-    for name, digest in zip(names, digests, strict=True):
-        whole.update(name.encode() + digest)
-    write_json(folder / "meta.json", {**meta, "hash": whole.hexdigest(), "arrays": names})
+        digests = dict(zip(names, pool.map(write, names), strict=True))
+    content_hash = _combine_digests(meta, {name: digest for name, (digest, _) in digests.items()})
+    checksums = {name: checksum for name, (_, checksum) in digests.items()}
+    write_json(folder / "meta.json", {**meta, "hash": content_hash, "arrays": names, "checksums": checksums})
 
 
 def read_meta(folder: Path) -> dict[str, Any]:
-    """`meta` as it was saved, with its content `hash` and the names of its `arrays`."""
+    """`meta` as it was saved, with its content `hash` and the names and checksums of its `arrays`."""
     return read_json(folder / "meta.json")
 
 
+def verify_result(folder: Path) -> None:
+    """Read a whole result; raises DamagedError unless it is what was saved."""
+    meta = read_meta(folder)
+    names = meta.get("arrays", [])
+    try:
+        digests = {n: hashlib.blake2b(_array_path(folder, n).read_bytes(), digest_size=20).digest() for n in names}
+    except OSError as error:
+        raise _damage(folder, str(error)) from error
+    if _combine_digests({key: meta[key] for key in meta if key not in _RESERVED}, digests) != meta.get("hash"):
+        raise _damage(folder, "its hash differs from the saved one")
+
+
 def read_arrays(folder: Path, only: Collection[str] | None = None) -> dict[str, np.ndarray]:
-    """The arrays of a result (those named in `only`); SessionError where one is missing or damaged."""
-    names = read_meta(folder).get("arrays", [])
+    """The arrays of a result (those named in `only`); DamagedError where one is missing or not what was saved."""
+    meta = read_meta(folder)
+    names, checksums = meta.get("arrays", []), meta.get("checksums", {})
     if only is not None and (unknown := set(only) - set(names)):
         raise InputError(f"{folder.name} holds no array {sorted(unknown)}: it holds {names}")
     arrays = {}
     for name in names:
         if only is not None and name not in only:
             continue
-        path = folder / _ARRAY_FOLDER / f"{name}.npy"
         try:
-            arrays[name] = np.load(path, allow_pickle=False)
-        except (OSError, ValueError, EOFError) as error:
-            raise SessionError(f"{path} is missing or damaged ({error}): compute the result again") from error
+            arrays[name] = np.load(_array_path(folder, name), allow_pickle=False)
+        except (OSError, ValueError, EOFError, MemoryError) as error:
+            raise _damage(folder, f"array {name}: {error}") from error
+        if name in checksums and _checksum(_make_header(arrays[name]), arrays[name]) != checksums[name]:
+            raise _damage(folder, f"array {name} differs from its checksum")
     return arrays
+
+
+def _array_path(folder: Path, name: str) -> Path:
+    """Return the file of one array of a result."""
+    return folder / _ARRAY_FOLDER / f"{name}.npy"
+
+
+def _make_header(array: np.ndarray) -> bytes:
+    """Return the header of the .npy file of a C-contiguous array."""
+    header = io.BytesIO()
+    np.lib.format.write_array_header_1_0(header, np.lib.format.header_data_from_array_1_0(array))
+    return header.getvalue()
+
+
+def _checksum(header: bytes, array: np.ndarray) -> int:
+    """Return the CRC-32C of the .npy file of a C-contiguous array."""
+    checksum: int = google_crc32c.extend(google_crc32c.value(header), array if array.size else b"")
+    return checksum
+
+
+def _combine_digests(meta: Mapping[str, Any], digests: Mapping[str, bytes]) -> str:
+    """Return the content hash of a result from its meta and the digests of its arrays in the order of their names."""
+    whole = hashlib.blake2b(to_json(dict(meta)), digest_size=20)
+    for name, digest in digests.items():
+        whole.update(name.encode() + digest)
+    return whole.hexdigest()
+
+
+def _damage(folder: Path, fault: str) -> DamagedError:
+    """Return the error for a damaged result, with its folder and the remedy."""
+    return DamagedError(f"the result in {folder} is damaged ({fault}): compute it again, or restore it from a copy")

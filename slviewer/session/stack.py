@@ -1,8 +1,9 @@
-"""A stack of frames as a Zarr v3 array: one uncompressed chunk a frame.
+"""A stack of frames as a Zarr v3 array: one uncompressed chunk a frame, with a checksum.
 
-Zarr's own library writes the array's description. The chunks are raw little-endian frames, and we move them
-ourselves: each is hashed, written and synced by the same thread, and a missing chunk is an error when read, where
-Zarr would hand back a black frame.
+Zarr's own library writes the array's description. The chunks are raw little-endian frames, each followed by its
+CRC-32C (Zarr's codec `crc32c`), and we move them ourselves: each is hashed, written and synced by the same thread, and
+a missing chunk is an error when read, where Zarr would hand back a black frame. Stacks without checksums, of older
+sessions, are read too: only `hash_stack` tells whether they are damaged.
 """
 
 import hashlib
@@ -10,17 +11,20 @@ import os
 import sys
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from io import RawIOBase
 from pathlib import Path
 
+import google_crc32c
 import numpy as np
 
-from slviewer.errors import InputError, SessionError
+from slviewer.errors import DamagedError, InputError, SessionError
 from slviewer.session.atomic import read_json, write_bytes
 
 _THREADS = 4  # moving and hashing frames releases the interpreter; more threads only queue for the disk
 _SEPARATOR = "."
 """Between the parts of a chunk's name: with Zarr's default, "/", every frame has two folders to be synced too."""
+_CHECKSUM_BYTES = 4
 _DTYPES = {np.dtype(np.uint8): "uint8", np.dtype(np.uint16): "uint16"}
 
 
@@ -35,8 +39,8 @@ def write_stack(path: Path, frames: np.ndarray) -> str:
     def write(index: int) -> bytes:
         """Write one frame as a chunk and return its digest."""
         frame = _to_little_endian(np.ascontiguousarray(frames[index]))
-        write_bytes(_chunk_path(path, _SEPARATOR, index), frame.data)
-        return hashlib.blake2b(frame.data, digest_size=20).digest()
+        write_bytes(_chunk_path(path, _SEPARATOR, index), frame.data, _checksum(frame))
+        return _digest(frame)
 
     with ThreadPoolExecutor(_THREADS) as pool:
         digests = list(pool.map(write, range(len(frames))))
@@ -46,52 +50,125 @@ def write_stack(path: Path, frames: np.ndarray) -> str:
 def read_stack(path: Path, indices: Sequence[int] | None = None) -> np.ndarray:
     """Frames (n, h, w) in the order of `indices` (all of them where None), C-contiguous; reads only these.
 
-    Raises SessionError where a frame is missing or cut short, InputError for an index outside the stack.
+    Raises DamagedError where a frame is missing, cut short or differs from its checksum, InputError for an index
+    outside the stack.
     """
-    shape, dtype, separator = _read_description(path)
-    wanted = list(range(shape[0])) if indices is None else [int(index) for index in indices]
-    if any(not 0 <= index < shape[0] for index in wanted):
-        raise InputError(f"frames {wanted} were requested, {path.parent.name} has frames 0 to {shape[0] - 1}")
-    stack = np.empty((len(wanted), *shape[1:]), dtype)
+    stack = _StoredStack.open(path)
+    n = stack.shape[0]
+    wanted = list(range(n)) if indices is None else [int(index) for index in indices]
+    if any(not 0 <= index < n for index in wanted):
+        raise InputError(f"frames {wanted} were requested, {path.parent.name} has frames 0 to {n - 1}")
+    frames = np.empty((len(wanted), *stack.shape[1:]), stack.dtype)
+    with ThreadPoolExecutor(_THREADS) as pool:
+        list(pool.map(stack.read, wanted, frames))
+    return frames if sys.byteorder == "little" else frames.byteswap(inplace=True)
 
-    def read(slot: int) -> None:
-        """Read one frame into its slot of the stack; SessionError where its file is missing or damaged."""
-        chunk = _chunk_path(path, separator, wanted[slot])
-        try:
-            with open(chunk, "rb", buffering=0) as file:
-                whole = os.fstat(file.fileno()).st_size == stack[slot].nbytes
-                whole = whole and _read_into(file, stack[slot])
-        except FileNotFoundError as error:
-            raise SessionError(f"{chunk} is missing: this capture is damaged, import or record it again") from error
-        except OSError as error:
-            raise SessionError(f"{chunk} cannot be read ({error}): check its permissions and the disk") from error
-        if not whole:
-            raise SessionError(f"{chunk} is cut short: this capture is damaged, import or record it again")
+
+def hash_stack(path: Path) -> str:
+    """Read a whole stack and return its content hash, as `write_stack` does. Raises DamagedError as `read_stack`."""
+    stack = _StoredStack.open(path)
+
+    def digest(index: int) -> bytes:
+        """Read one frame and return its digest."""
+        frame = np.empty(stack.shape[1:], stack.dtype)
+        stack.read(index, frame)
+        return _digest(frame)
 
     with ThreadPoolExecutor(_THREADS) as pool:
-        list(pool.map(read, range(len(wanted))))
-    return stack if sys.byteorder == "little" else stack.byteswap(inplace=True)
+        return _combine_digests(stack.shape, stack.dtype, list(pool.map(digest, range(stack.shape[0]))))
+
+
+def hash_frames(frames: np.ndarray) -> str:
+    """Return the content hash that frames (n, h, w), uint8 or uint16, have once they are written."""
+    with ThreadPoolExecutor(_THREADS) as pool:
+        digests = list(pool.map(lambda frame: _digest(_to_little_endian(np.ascontiguousarray(frame))), frames))
+    return _combine_digests(frames.shape, frames.dtype, digests)
+
+
+def identify_stack(path: Path) -> tuple[tuple[int, ...], ...] | None:
+    """Return what changes whenever a frame's file does (number, size, time), or None where every frame has a checksum.
+
+    Raises DamagedError where a file is missing.
+    """
+    stack = _StoredStack.open(path)
+    return None if stack.has_checksums else tuple(stack.identify(index) for index in range(stack.shape[0]))
 
 
 def describe_stack(path: Path) -> tuple[tuple[int, int, int], np.dtype]:
     """Return shape (n, h, w) and type of a stack; SessionError where its layout is not the one written here."""
-    return _read_description(path)[:2]
+    stack = _StoredStack.open(path)
+    return stack.shape, stack.dtype
 
 
-def _read_description(path: Path) -> tuple[tuple[int, int, int], np.dtype, str]:
-    """Return shape (n, h, w), dtype and chunk separator of a stack; SessionError for another layout."""
-    description = read_json(path / "zarr.json")
-    try:
-        n, height, width = (int(extent) for extent in description["shape"])
-        dtype = np.dtype(description["data_type"])
-        chunk = description["chunk_grid"]["configuration"]["chunk_shape"]
-        separator = description["chunk_key_encoding"]["configuration"]["separator"]
-        codecs = [codec["name"] for codec in description["codecs"]]
-    except (KeyError, TypeError, ValueError) as error:
-        raise SessionError(f"{path} does not describe a stack of frames ({error}): import the capture again") from error
-    if dtype not in _DTYPES or chunk != [1, height, width] or separator not in (".", "/") or codecs != ["bytes"]:
-        raise SessionError(f"{path} was not laid out by slviewer (one uncompressed chunk a frame): import it again")
-    return (n, height, width), dtype, separator
+@dataclass(frozen=True)
+class _StoredStack:
+    """The description of a stack on disk, and access to its chunks."""
+
+    path: Path
+    shape: tuple[int, int, int]
+    dtype: np.dtype
+    separator: str
+    has_checksums: bool
+
+    @classmethod
+    def open(cls, path: Path) -> "_StoredStack":
+        """Read the description of a stack; SessionError for another layout."""
+        description = read_json(path / "zarr.json")
+        try:
+            n, height, width = (int(extent) for extent in description["shape"])
+            dtype = np.dtype(description["data_type"])
+            chunk = description["chunk_grid"]["configuration"]["chunk_shape"]
+            separator = description["chunk_key_encoding"]["configuration"]["separator"]
+            codecs = [codec["name"] for codec in description["codecs"]]
+        except (KeyError, TypeError, ValueError) as error:
+            raise SessionError(
+                f"{path} does not describe a stack of frames ({error}): import the capture again"
+            ) from error
+        known = codecs in (["bytes"], ["bytes", "crc32c"])
+        if dtype not in _DTYPES or chunk != [1, height, width] or separator not in (".", "/") or not known:
+            raise SessionError(f"{path} was not laid out by slviewer (one uncompressed chunk a frame): import it again")
+        return cls(path, (n, height, width), dtype, separator, "crc32c" in codecs)
+
+    def read(self, index: int, frame: np.ndarray) -> None:
+        """Read one frame, little-endian, into `frame` (h, w). Raises DamagedError where it is not what was saved."""
+        chunk, checksum = self._chunk_path(index), bytearray(_CHECKSUM_BYTES * self.has_checksums)
+        try:
+            with open(chunk, "rb", buffering=0) as file:
+                whole = os.fstat(file.fileno()).st_size == frame.nbytes + len(checksum)
+                whole = whole and _read_into(file, frame.data.cast("B")) and _read_into(file, memoryview(checksum))
+        except OSError as error:
+            raise self._error(index, error) from error
+        if not whole:
+            raise self._damage(index, "is cut short")
+        if checksum and checksum != _checksum(frame):
+            raise self._damage(index, "differs from its checksum")
+
+    def identify(self, index: int) -> tuple[int, ...]:
+        """Return number, size and time of a frame's file. Raises DamagedError where it is missing."""
+        try:
+            status = self._chunk_path(index).stat()
+        except OSError as error:
+            raise self._error(index, error) from error
+        return status.st_ino, status.st_size, status.st_mtime_ns
+
+    def _chunk_path(self, index: int) -> Path:
+        """Return the file of one frame's chunk."""
+        return _chunk_path(self.path, self.separator, index)
+
+    def _error(self, index: int, error: OSError) -> SessionError:
+        """Return the error for a chunk that cannot be read: damage, unless it is for want of permission."""
+        if isinstance(error, PermissionError):
+            return SessionError(f"{self._chunk_path(index)} cannot be read ({error}): check its permissions")
+        missing = isinstance(error, FileNotFoundError | NotADirectoryError)
+        return self._damage(index, "is missing" if missing else f"cannot be read ({error.strerror or error})")
+
+    def _damage(self, index: int, fault: str) -> DamagedError:
+        """Return the error for a damaged frame, with the capture's name and the remedy."""
+        capture, file = self.path.parent.name, self._chunk_path(index)
+        return DamagedError(
+            f"{capture}: frame {index} of {self.shape[0]} is damaged ({file} {fault}): "
+            "restore this file from a copy, or import or record the capture again"
+        )
 
 
 def check_frames(frames: np.ndarray) -> None:
@@ -103,15 +180,16 @@ def check_frames(frames: np.ndarray) -> None:
 
 
 def _create_array(path: Path, shape: tuple[int, ...], dtype: str) -> None:
-    """Create the metadata of an uncompressed Zarr v3 array with one chunk a frame."""
+    """Create the metadata of an uncompressed Zarr v3 array with one chunk, and its checksum, a frame."""
     import zarr  # half a second; needed only to write
+    from zarr.codecs import Crc32cCodec
 
     zarr.create_array(
         path,
         shape=shape,
         dtype=dtype,
         chunks=(1, *shape[1:]),
-        compressors=None,
+        compressors=[Crc32cCodec()],
         filters=None,
         fill_value=0,
         zarr_format=3,
@@ -128,9 +206,8 @@ def _chunk_path(path: Path, separator: str, index: int) -> Path:
     return path / separator.join(("c", str(index), "0", "0"))
 
 
-def _read_into(file: RawIOBase, frame: np.ndarray) -> bool:
-    """Read a file into a frame's memory; returns whether it held enough bytes."""
-    view = frame.data.cast("B")
+def _read_into(file: RawIOBase, view: memoryview) -> bool:
+    """Read a file into memory; returns whether it held enough bytes."""
     done = 0
     while done < len(view):
         count = file.readinto(view[done:])
@@ -138,6 +215,16 @@ def _read_into(file: RawIOBase, frame: np.ndarray) -> bool:
             return False
         done += count
     return True
+
+
+def _checksum(frame: np.ndarray) -> bytes:
+    """Return the CRC-32C of a frame's bytes, as Zarr appends it to a chunk."""
+    return google_crc32c.value(frame).to_bytes(_CHECKSUM_BYTES, "little")
+
+
+def _digest(frame: np.ndarray) -> bytes:
+    """Return the digest of a frame's bytes, of which the content hash is made."""
+    return hashlib.blake2b(frame.data, digest_size=20).digest()
 
 
 def _to_little_endian(frame: np.ndarray) -> np.ndarray:

@@ -9,14 +9,24 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from slviewer.errors import InputError, SessionError
+from slviewer.errors import DamagedError, InputError, SessionError
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.session import atomic
-from slviewer.session.capture import Capture, NewCapture, Role, read_capture, write_capture
-from slviewer.session.layout import create_layout, inner_folders, is_session, new_folder, session_folder
+from slviewer.session.capture import (
+    Capture,
+    Comparison,
+    NewCapture,
+    Role,
+    compare_captures,
+    read_capture,
+    write_capture,
+)
+from slviewer.session.layout import create_layout, inner_folders, is_session, new_folder, remove_layout, session_folder
 from slviewer.session.lock import WriterLock
-from slviewer.session.names import natural_key, safe_name, safe_path
+from slviewer.session.names import is_safe_name, natural_key, safe_name, safe_path
 from slviewer.session.results import check_place, check_result, list_results, read_arrays, read_meta, write_result
+
+_CREATION_ATTEMPTS = 5
 
 State = Literal["absent", "fresh", "stale"]
 
@@ -33,21 +43,26 @@ class Session:
         self._lock = lock
         self._decisions_lock = threading.Lock()
         self._allow: Callable[[], None] | None = None
+        self._created: Literal["", "session", "folder"] = ""  # what this object made
+        self.recovered: tuple[str, ...] = ()  # captures that a writer died before it could finish, completed on opening
 
     # opening and closing
 
     @classmethod
     def create(cls, path: str | Path) -> "Session":
         """A new session, open for writing, in a new or empty folder; SessionError where something is there already."""
-        folder = new_folder(path)
+        folder, is_new_folder = new_folder(path)
         lock = WriterLock(folder)
         lock.acquire()
         try:
+            new_folder(path)  # another process may have made one before the lock was taken
             create_layout(folder)
         except BaseException:
             lock.release()
             raise
-        return cls(folder, lock)
+        session = cls(folder, lock)
+        session._created = "folder" if is_new_folder else "session"
+        return session
 
     @classmethod
     def open(cls, path: str | Path, write: bool = False) -> "Session":
@@ -62,6 +77,8 @@ class Session:
             lock.acquire()
         session = cls(folder, lock if write else None)
         try:
+            if write:
+                session_folder(path)  # its creator may have removed it before the lock was taken
             session._recover()
         except BaseException:
             session.close()
@@ -71,7 +88,24 @@ class Session:
     @classmethod
     def open_or_create(cls, path: str | Path) -> "Session":
         """The session in a folder, open for writing; made where the folder is missing or empty."""
-        return cls.open(path, write=True) if is_session(path) else cls.create(path)
+        for _ in range(_CREATION_ATTEMPTS):  # another process may create or remove it meanwhile
+            was_session = is_session(path)
+            try:
+                return cls.open(path, write=True) if was_session else cls.create(path)
+            except SessionError:
+                if is_session(path) == was_session and Path(path).expanduser().exists():
+                    raise
+        return cls.create(path)
+
+    def remove_if_new(self) -> None:
+        """Close a session that this object created, and remove it, unless something was saved in it."""
+        if not self._created or self._lock is None or not self._lock.held:
+            return
+        with contextlib.suppress(OSError):  # what cannot be removed stays
+            if remove_layout(self.folder):
+                self._lock.release_and_remove()
+                if self._created == "folder":
+                    self.folder.rmdir()
 
     def close(self) -> None:
         """Let the next writer in. Does nothing for a reader or when called again."""
@@ -97,14 +131,40 @@ class Session:
     # captures
 
     def capture_names(self, role: Role | None = None) -> list[str]:
-        """Names of the captures (of one role), `pose_2` before `pose_10`."""
-        names = sorted(inner_folders(self.folder / "captures"), key=natural_key)
-        return names if role is None else [name for name in names if self.load_capture(name).role == role]
+        """Names of the captures (of one role, as far as they can be read), `pose_2` before `pose_10`."""
+        if role is not None:
+            return [capture.name for capture in self.captures(role)]
+        return [name for name in self.taken_names() if is_safe_name(name) and self._has_description(name)]
+
+    def taken_names(self) -> list[str]:
+        """Names that a new capture cannot have: of the captures, and of other folders in their place."""
+        return sorted(inner_folders(self.folder / "captures"), key=natural_key)
 
     def captures(self, role: Role | None = None) -> list[Capture]:
-        """The captures (of one role) in the order of `capture_names`; their frames stay on disk."""
-        loaded = [self.load_capture(name) for name in self.capture_names()]
-        return [capture for capture in loaded if role in (None, capture.role)]
+        """The captures (of one role) in the order of `capture_names`, without damaged ones; frames stay on disk."""
+        return [capture for capture in self.read_captures()[0] if role in (None, capture.role)]
+
+    def read_captures(self) -> tuple[list[Capture], dict[str, str]]:
+        """The captures, and of every other folder in their place {name: what is wrong with it, and the remedy}."""
+        captures, faults = [], {}
+        for name in self.taken_names():
+            folder = self.folder / "captures" / name
+            if not is_safe_name(name):
+                faults[name] = (
+                    f"{folder} is not read: rename it, with letters, digits, '_', '-' and '.', or move it away"
+                )
+            elif not self._has_description(name):
+                faults[name] = f"{folder} is no capture (it holds no capture.json): restore the file, or move it away"
+            else:
+                try:
+                    captures.append(read_capture(folder))
+                except SessionError as error:
+                    faults[name] = str(error)
+        return captures, faults
+
+    def compare_capture(self, new: NewCapture, role: Role) -> Comparison:
+        """How the capture of the name of `new`, checked, compares with it."""
+        return compare_captures(self._capture_folder(new.name), new, role)
 
     def load_capture(self, name: str) -> Capture:
         """A capture; its frames stay on disk until they are read. InputError where it does not exist."""
@@ -139,18 +199,26 @@ class Session:
         return self.save_captures([capture], role, board=board, force=force)[0]
 
     def save_captures(
-        self, captures: Iterable[NewCapture], role: Role, *, board: object | None = None, force: bool = False
+        self,
+        captures: Iterable[NewCapture],
+        role: Role,
+        *,
+        board: object | None = None,
+        force: bool | Collection[str] = False,
     ) -> list[Capture]:
         """Save all of `captures` or, where any of them fails (or the iterable raises), none.
 
-        Takes them one at a time, so that a generator needs memory for one; returns them in that order.
+        Takes them one at a time, so that a generator needs memory for one; returns them in that order. `force`: whether
+        those of the same name are replaced, or the names of those that are. If the program dies, the next one to open
+        the session completes those that were written.
         """
         staged: dict[str, Path] = {}
         try:
             for new in captures:
                 if new.name in staged:
                     raise InputError(f"two captures are named {new.name!r}: rename one of their folders")
-                staged[new.name] = self._stage(new, role, None if board is None else str(board), force)
+                replace = force if isinstance(force, bool) else new.name in force
+                staged[new.name] = self._stage(new, role, None if board is None else str(board), replace)
                 del new  # before the next one is made
         except BaseException:
             for folder in staged.values():
@@ -170,7 +238,12 @@ class Session:
 
     def deleted_captures(self, role: Role | None = None) -> list[str]:
         """Names of the captures in the trash that `restore_capture` can bring back, the last deleted first."""
-        return [name for name, place in self._restorable().items() if role is None or read_capture(place).role == role]
+        names = []
+        for name, place in self._restorable().items():
+            with contextlib.suppress(DamagedError):
+                if role is None or read_capture(place).role == role:
+                    names.append(name)
+        return names
 
     def restore_capture(self, name: str) -> Capture:
         """Bring the last deleted capture of that name back. InputError where there is none, or the name is in use."""
@@ -255,16 +328,30 @@ class Session:
         return hashes
 
     def state_of(self, name: str) -> State:
-        """Return `fresh`, `stale` or `absent`; fresh if every input of the result is fresh and has the hash it had."""
+        """Return `fresh`, `stale` or `absent`; fresh if every input of the result is fresh and has the hash it had.
+
+        A result or input whose description is damaged makes it stale.
+        """
         folder = self.folder / "results" / safe_path(name)
         if not (folder / "meta.json").is_file():
             return "absent"
-        for input_name, used in read_meta(folder).get("inputs", {}).items():
-            if used not in self._hashes(input_name):
-                return "stale"
-            if input_name != name and self.state_of(input_name) == "stale":
-                return "stale"
-        return "fresh"
+        with contextlib.suppress(DamagedError):
+            for input_name, used in read_meta(folder).get("inputs", {}).items():
+                if used not in self._hashes(input_name):
+                    return "stale"
+                if input_name != name and self.state_of(input_name) == "stale":
+                    return "stale"
+            return "fresh"
+        return "stale"
+
+    def load_fresh(
+        self, name: str, only: Collection[str] | None = None
+    ) -> tuple[dict[str, Any], dict[str, np.ndarray]] | None:
+        """What `load_result` returns for a result that is fresh and whole; None for any other, to be computed again."""
+        if self.state_of(name) == "fresh":
+            with contextlib.suppress(DamagedError):
+                return self.load_result(name, only)
+        return None
 
     # decisions and exports
 
@@ -315,17 +402,23 @@ class Session:
     # inside
 
     def _recover(self) -> None:
-        """Remove the leftovers of dead writers; a reader does so only without a writer, in a writable folder."""
+        """Finish what dead writers began; a reader does so only without a writer, in a writable folder."""
+
+        def recover() -> None:
+            """Complete or remove their files, and remember the captures that were completed."""
+            completed = atomic.recover(self.folder, self._trash_place_of)
+            self.recovered = tuple(path.name for path in completed if path.parent == self.folder / "captures")
+
         if not atomic.list_leftovers(self.folder):
             return
         if self._lock is not None:
-            atomic.recover(self.folder, self.folder / "trash")
+            recover()
             return
         lock = WriterLock(self.folder)
         with contextlib.suppress(SessionError, OSError):
             lock.acquire(patience_s=0)
             try:
-                atomic.recover(self.folder, self.folder / "trash")
+                recover()
             finally:
                 lock.release()
 
@@ -354,15 +447,24 @@ class Session:
         capture.check()
         with atomic.staged_folder(target, capture.nbytes) as staged:
             write_capture(staged, capture, role, board)
-        return staged
+        return atomic.mark_complete(staged)
 
     def _capture_folder(self, name: str) -> Path:
         """Return the folder of a capture; InputError for an unsafe name."""
         return self.folder / "captures" / safe_name(name)
 
+    def _has_description(self, name: str) -> bool:
+        """Whether the folder of a capture holds its description, sound or not."""
+        return (self._capture_folder(name) / "capture.json").is_file()
+
     def _trash_place(self, name: str) -> Path:
         """Return a new path in the trash, with the time of deletion behind the name."""
         return self.folder / "trash" / f"{name}-{datetime.now(UTC).strftime('%Y%m%dT%H%M%S%f')}"
+
+    def _trash_place_of(self, folder: Path) -> Path:
+        """Return a new path in the trash for the folder of a capture or result."""
+        parts = folder.relative_to(self.folder).parts
+        return self._trash_place("-".join(parts[1:]) or parts[0])
 
     def _restorable(self) -> dict[str, Path]:
         """{name: the place in the trash of its latest version} of captures whose names are free, the latest first."""
@@ -377,7 +479,7 @@ class Session:
     def _hashes(self, name: str) -> list[str]:
         """Content hashes of the capture and of the result of that name, where there are any."""
         content_hashes = []
-        if "/" not in name and self._capture_folder(name).is_dir():
+        if "/" not in name and self._has_description(name):
             content_hashes.append(self.load_capture(name).hash)
         folder = self.folder / "results" / safe_path(name)
         if (folder / "meta.json").is_file():

@@ -141,7 +141,7 @@ class CaptureRequests(ResultRequests):
 
     def _next_name(self, kind: str) -> str:
         """Return the next unused name, such as pose_07, counting saved and queued captures."""
-        used_names = [*self._engine.store.capture_names(), *self._engine.acquisition.names()]
+        used_names = [*self._engine.store.taken_names(), *self._engine.acquisition.names()]
         numbers = [name.removeprefix(f"{kind}_") for name in used_names if name.startswith(f"{kind}_")]
         number = max((int(number) for number in numbers if number.isdecimal()), default=0) + 1
         return f"{kind}_{number:02d}"

@@ -38,6 +38,25 @@ def write_captures(source: Path, count: int) -> list[Path]:
     return folders
 
 
+def test_an_import_that_is_repeated_adds_what_is_missing(run: Run, tmp_path: Path) -> None:
+    write_captures(tmp_path / "source", 3)
+    session, options = tmp_path / "session", ("--projector", "120x90")
+    assert run("import", "procam-calibration", tmp_path / "source" / "capture_1", session, *options)[0] == 0
+    chunk = session / "captures/capture_1/frames.zarr/c.2.0.0"
+    sound = chunk.read_bytes()
+    status, out, err = run("import", "procam-calibration", tmp_path / "source", session, *options)
+    assert status == 0 and "3 captures imported" in out and "not imported again: capture_1\n" in err
+    assert not (session / "trash").exists()
+    chunk.write_bytes(sound[:100] + bytes(len(sound) - 100))  # the remedy for damage is to import again
+    status, _, err = run("import", "procam-calibration", tmp_path / "source", session, *options)
+    assert status == 0 and "capture_1: its stored frames are damaged" in err and "again: capture_0, capture_2\n" in err
+    assert chunk.read_bytes() == sound and len(list((session / "trash").iterdir())) == 1
+    image = tmp_path / "source" / "capture_2" / "graycode_04.png"
+    assert cv2.imwrite(str(image), cv2.imread(str(image), cv2.IMREAD_UNCHANGED) // 2 * 2)
+    status, _, err = run("import", "procam-calibration", tmp_path / "source", session, *options)
+    assert status == 1 and "there is a capture 'capture_2' already" in err
+
+
 @pytest.fixture
 def faulty(tmp_path: Path) -> Path:
     """Five captures: one with a file cut short, one with a missing file, one in the dark, two sound."""

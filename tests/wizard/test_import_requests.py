@@ -70,6 +70,9 @@ def test_a_zip_becomes_scans_and_leaves_nothing_behind(operator: Operator, sourc
     assert not [path for path in operator.session.folder.iterdir() if "import" in path.name]
     assert operator.import_zip("one.zip", archived(source / "capture_0"), role="scan", projector="120x90")
     operator.wait_until_idle(60)
+    assert any("capture_0" in text and "already" in text for text in texts(operator, "warning"))
+    assert operator.import_zip("one.zip", archived(source / "capture_0"), projector="120x90")  # as poses
+    operator.wait_until_idle(60)
     assert any("capture_0" in text and "already" in text for text in texts(operator, "error"))
 
 
