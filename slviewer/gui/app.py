@@ -244,8 +244,7 @@ def _wait_for_stop() -> None:
 def _check_granted(operator: Operator, granted: bool) -> None:
     """Raise SlviewerError with the notice of the error unless a request was granted."""
     if not granted:
-        failed = operator.wait_for(lambda s: any(n.level == "error" for n in s.notices), 2.0)
-        raise SlviewerError(failed.notices[-1].text if failed else "the wizard could not start: see its log")
+        raise SlviewerError(next(notice.text for notice in reversed(operator.notices()) if notice.level == "error"))
 
 
 def _open_browser(url: str) -> None:

@@ -40,6 +40,7 @@ _NOTICES: dict[Level, tuple[str, Any, float, Tone]] = {
 """{level: title, colour and duration s of a notification, tone in the panel}."""
 _SCROLL_BAR_MARGIN = "<style>.mantine-ScrollArea-content{padding-right:10px}</style>"
 _MOST_NOTICES = 12  # of the latest, in the panel
+_MOST_FAULTS = 3  # of the session's files, in the panel
 DEVICES = "devices"
 
 
@@ -221,7 +222,7 @@ class Shell:
         """Show the session's folder, contents and free space, the autopilot and the latest notices."""
         session, space = snapshot.session, snapshot.space
         if session is None:
-            self._session.set(alert("No session is open: enter a folder.", "warning"))
+            self._session.set(alert("No session is open: enter a folder.", "warning") + _fault_alerts(snapshot))
         else:
             lines = [
                 f"<b>{to_html(session.folder.name)}</b>",
@@ -233,7 +234,7 @@ class Shell:
                 lines.append(
                     coloured(f"{format_bytes(space.free_bytes)} free{needs}", "dim" if space.enough else "error")
                 )
-            self._session.set(paragraph(Html("<br>".join(lines))))
+            self._session.set(paragraph(Html("<br>".join(lines))) + _fault_alerts(snapshot))
         change(
             self._autopilot,
             visible=snapshot.rig.simulated,
@@ -312,6 +313,15 @@ def _running_work(snapshot: Snapshot) -> list[tuple[str, float]]:
         text = f"Preparing, {100 * snapshot.preparing:.0f} %: first steps may take longer until then"
         work.append((text, snapshot.preparing))
     return work
+
+
+def _fault_alerts(snapshot: Snapshot) -> str:
+    """Return the HTML of what could not be read of the session, as alerts."""
+    faults = list(snapshot.session.faults) if snapshot.session is not None else []
+    if len(faults) > _MOST_FAULTS:
+        faults[_MOST_FAULTS:] = [f"{len(faults) - _MOST_FAULTS} more files are damaged: `slviewer inspect` lists them."]
+    stated = [snapshot.read_failure, *faults] if snapshot.read_failure else faults
+    return "".join(alert(fault, "error") for fault in stated)
 
 
 def _notice_html(notice: Notice) -> str:

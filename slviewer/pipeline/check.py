@@ -116,8 +116,9 @@ def check(
 
 def _drift_reference(store: Session, stereo: StereoModel, capture: str) -> DriftReference:
     """Load or build the drift reference from the calibration's poses except the capture; stored, as it is slow."""
-    if store.state_of(REFERENCE) == "fresh" and capture not in stereo.poses:
-        return DriftReference.from_arrays(stereo.rig, store.load_result(REFERENCE)[1])
+    saved = store.load_fresh(REFERENCE) if capture not in stereo.poses else None
+    if saved is not None:
+        return DriftReference.from_arrays(stereo.rig, saved[1])
     poses = [name for name in stereo.poses if name != capture]
     reference = build_reference(stereo.rig, [DriftView.from_observation(o) for o in load_observations(store, poses)])
     if capture not in stereo.poses:

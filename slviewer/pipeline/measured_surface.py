@@ -14,7 +14,7 @@ from slviewer.pipeline.export_shapes import read_merge, scan_cloud
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
 from slviewer.pipeline.models import Model, check_accepted, load_model, preferred_model, warn_if_stale
 from slviewer.pipeline.open_session import SessionLike, opened
-from slviewer.pipeline.scale import scale_factor, scale_sigma
+from slviewer.pipeline.scale import load_scale_correction, scale_factor, scale_sigma
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.reconstruction.reconstruct import normals as grid_normals
 from slviewer.session.store import Session
@@ -125,7 +125,7 @@ def surface_from_cloud(store: Session, scan: str, cloud: Cloud, fitted: Model) -
     """A capture's cloud, made with one of the session's calibrations, as a surface to measure on."""
     calibration = f"calibration/{fitted.name}"
     names = [scan, calibration]
-    if store.state_of(f"scale/{fitted.name}") == "fresh":
+    if load_scale_correction(store, fitted.name) is not None:
         names.append(f"scale/{fitted.name}")
     inputs, scale = store.input_hashes(*names), scale_factor(store, fitted.name)
     shared = None

@@ -214,9 +214,8 @@ def recommended_model(store: Session) -> str:
 def load_validation(store: Session) -> CrossValidation | None:
     """How the session's calibrations compare on poses that they were not made from; None where they were not compared
     them as they are now."""
-    if store.state_of(VALIDATION) != "fresh":
-        return None
-    return from_plain(store.load_result(VALIDATION, only=())[0]["validation"], CrossValidation)
+    saved = store.load_fresh(VALIDATION, only=())
+    return None if saved is None else from_plain(saved[0]["validation"], CrossValidation)
 
 
 def rejection_reason(store: Session) -> str:

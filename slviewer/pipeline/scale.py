@@ -12,10 +12,13 @@ from slviewer.session.store import Session
 
 
 def load_scale_correction(store: Session, model: str) -> dict[str, Any] | None:
-    """Return the scale correction of a calibration, as ``record_scale`` stored it; None where it is missing or
-    outdated."""
-    name = f"scale/{model}"
-    return store.load_result(name, only=())[0] if store.state_of(name) == "fresh" else None
+    """Return the scale correction of a calibration, as ``record_scale`` stored it; None where there is none, or it is
+    of another calibration."""
+    name, calibration = f"scale/{model}", f"calibration/{model}"
+    if not (store.has_result(name) and store.has_result(calibration)):
+        return None
+    meta = store.load_result(name, only=())[0]
+    return meta if meta["inputs"] == store.input_hashes(calibration) else None
 
 
 def scale_factor(store: Session, model: str) -> float:

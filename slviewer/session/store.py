@@ -330,26 +330,28 @@ class Session:
     def state_of(self, name: str) -> State:
         """Return `fresh`, `stale` or `absent`; fresh if every input of the result is fresh and has the hash it had.
 
-        A result or input whose description is damaged makes it stale.
+        A damaged input makes it stale; DamagedError where the result's own description is damaged.
         """
         folder = self.folder / "results" / safe_path(name)
         if not (folder / "meta.json").is_file():
             return "absent"
-        with contextlib.suppress(DamagedError):
-            for input_name, used in read_meta(folder).get("inputs", {}).items():
+        inputs = read_meta(folder).get("inputs", {})
+        try:
+            for input_name, used in inputs.items():
                 if used not in self._hashes(input_name):
                     return "stale"
                 if input_name != name and self.state_of(input_name) == "stale":
                     return "stale"
-            return "fresh"
-        return "stale"
+        except DamagedError:
+            return "stale"
+        return "fresh"
 
     def load_fresh(
         self, name: str, only: Collection[str] | None = None
     ) -> tuple[dict[str, Any], dict[str, np.ndarray]] | None:
         """What `load_result` returns for a result that is fresh and whole; None for any other, to be computed again."""
-        if self.state_of(name) == "fresh":
-            with contextlib.suppress(DamagedError):
+        with contextlib.suppress(DamagedError):
+            if self.state_of(name) == "fresh":
                 return self.load_result(name, only)
         return None
 

@@ -16,7 +16,7 @@ import numpy as np
 from slviewer.calibration.observe import Observation, Smoothing
 from slviewer.devices.protocols import CameraSettings
 from slviewer.devices.world import SimulatedWorld
-from slviewer.errors import InputError, SessionError, SlviewerError
+from slviewer.errors import DamagedError, InputError, SessionError, SlviewerError
 from slviewer.pipeline.check_results import Preflight
 from slviewer.pipeline.frame_check import load_check, load_or_save_check
 from slviewer.pipeline.poses import read_stored_poses
@@ -62,11 +62,11 @@ class Engine:
         self._choice: Choice | None = None
         self._rig_fault = ""  # why the chosen rig could not even be set up
         self._reader: SessionReader | None = None
-        self._queued: set[tuple[str, str]] = set()
+        self._queued: set[tuple[str, str, str]] = set()  # captures by name and content hash, and the target
         self._brightness: Brightness = ""
         # the publisher's thread alone writes these:
         self._reached: tuple[Path | None, bool] = (None, False)  # a session, and whether its poses were enough
-        self._failed_reads = 0
+        self._failed_reads, self._reported_faults = 0, set[str]()
         empty = Snapshot(0, None, RigView(), None, None, (), views(Facts(None, RigView(), None)), None, False, "")
         self.publisher = Publisher(self._build_snapshot, empty)
         self.notices = Notices(self.publisher.mark_changed)
@@ -127,6 +127,8 @@ class Engine:
             self._merge_failure = ""
             if before is not None:
                 before.close()
+            for name in store.recovered:
+                self.notices.add("info", f"{name} was complete when the program ended, and is in the session again")
             try:
                 self._restore_rig(store, rig)
             finally:
@@ -261,7 +263,7 @@ class Engine:
             return
         target = reader.target()
         for capture in reader.session.captures():
-            key = (capture.hash, target)
+            key = (capture.name, capture.hash, target)
             with self.lock:
                 if key in self._queued:
                     continue
@@ -277,7 +279,7 @@ class Engine:
     def reprocess(self, capture: Capture) -> None:
         """Process a restored capture again, whose results no longer exist."""
         with self.lock:
-            self._queued = {key for key in self._queued if key[0] != capture.hash}
+            self._queued = {key for key in self._queued if key[1] != capture.hash}
         self.queue_processing()
 
     def _process_capture(self, reader: SessionReader, capture: Capture, report: Reporter) -> None:
@@ -316,7 +318,7 @@ class Engine:
     def _handle_processing_failure(self, reader: SessionReader, capture: Capture, error: BaseException) -> None:
         """Report that a capture could not be processed, and store why it is unreadable."""
         self.notices.add_failure(f"Processing {capture.name}", error)
-        if isinstance(error, InputError):
+        if isinstance(error, InputError | DamagedError):
             reader.add_unreadable(capture, str(error))
         self.publisher.mark_changed(session=True)
 
@@ -347,9 +349,13 @@ class Engine:
             read_failure = ""
             try:
                 session = reader.read(rig, bench.focal_px if bench else None)
-            except (SlviewerError, OSError) as error:  # most likely files were being changed
+            except Exception as error:  # most likely files were being changed
                 read_failure = describe_error("Reading the session", error)
-        space = self.space(reader.count_frames(rig) if reader is not None else None)
+        space = None
+        try:
+            space = self.space(reader.count_frames(rig) if reader is not None else None)
+        except (SlviewerError, OSError) as error:
+            read_failure = read_failure or describe_error("Reading the session", error)
         if self._rig_fault:
             rig = replace(rig, state="lost", fault=self._rig_fault)
         world = None
@@ -380,12 +386,17 @@ class Engine:
 
     def _follow_up(self, snapshot: Snapshot) -> None:
         """Act on a new snapshot: retry failed reads, plan the next pose, end hands-free capture."""
-        self._failed_reads = self._failed_reads + 1 if snapshot.read_failure else 0
+        session = snapshot.session
+        faults = (snapshot.read_failure,) if snapshot.read_failure else session.faults if session else ()
+        new_faults = [fault for fault in faults if fault not in self._reported_faults]
+        self._reported_faults &= set(faults)
+        self._failed_reads = self._failed_reads + 1 if new_faults else 0
         if 0 < self._failed_reads < READ_ATTEMPTS:
             self.publisher.mark_changed(session=True)
-        elif self._failed_reads == READ_ATTEMPTS:  # reported once, until it can be read again
-            self.notices.add("error", snapshot.read_failure)
-        session = snapshot.session
+        elif new_faults:  # each is reported once, until it can be read again
+            self._reported_faults |= set(new_faults)
+            for fault in new_faults:
+                self.notices.add("error", fault)
         self.watcher.watch(_choose_watch(session))
         if session is None:
             return

@@ -19,7 +19,7 @@ from slviewer.wizard.measure_requests import MeasureRequests
 from slviewer.wizard.merge_requests import MergeRequests
 from slviewer.wizard.requests import request
 from slviewer.wizard.rig_requests import RigRequests
-from slviewer.wizard.snapshot import Level, PreviewView, Snapshot
+from slviewer.wizard.snapshot import Level, Notice, PreviewView, Snapshot
 from slviewer.wizard.surfaces import Surfaces
 
 
@@ -88,6 +88,10 @@ class Operator(RigRequests, LiveRequests, MergeRequests, MeasureRequests, Import
                 remove()
 
         return stop
+
+    def notices(self) -> tuple[Notice, ...]:
+        """Return the latest notices, oldest first, also those that no snapshot shows yet."""
+        return self._engine.notices.all()
 
     def wait_for(self, condition: Callable[[Snapshot], bool], timeout_s: float) -> Snapshot | None:
         """Wait for the first snapshot for which `condition` holds, and return it; None after `timeout_s`."""

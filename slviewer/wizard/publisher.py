@@ -3,14 +3,17 @@
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Generic, TypeVar
 
-from slviewer.wizard.notices import log
+from slviewer.wizard.notices import describe_error, log
 from slviewer.wizard.snapshot import Snapshot
 
 PAUSE_S = 0.05
 """Between two snapshots: a panel needs no more than twenty a second."""
 REFRESH_S = 30.0
+RETRY_S = 2.0
+"""After a snapshot that is not the current state, until the next is built although nothing is known to have changed."""
 
 Item = TypeVar("Item")
 
@@ -45,6 +48,9 @@ class Listeners(Generic[Item]):
 
 class Publisher:
     """Builds a snapshot when something has changed, and publishes it to every listener.
+
+    Where that fails, the last snapshot is published again with the reason as its `read_failure`, and another is built
+    every `RETRY_S` seconds until one succeeds.
 
     `build(version, session_changed)` and the listeners are called on the publisher's thread alone.
     """
@@ -103,24 +109,27 @@ class Publisher:
         self._thread.join(5.0)
 
     def _serve(self) -> None:
-        """Build and publish a snapshot after each batch of changes until closing; a failed build is logged."""
+        """Build and publish a snapshot after each batch of changes, or after a failure, until closing."""
         while True:
             with self._condition:
-                self._condition.wait_for(lambda: self._requested > self._published or self._closing)
+                self._condition.wait_for(
+                    lambda: self._requested > self._published or self._closing,
+                    RETRY_S if self.latest.read_failure else None,
+                )
                 if self._closing:
                     return
-                requested, session = self._requested, self._session_changed
+                requested, session = self._requested, self._session_changed or bool(self.latest.read_failure)
                 self._session_changed = self._urgent = False
+            version = self.latest.version + 1
             try:
-                snapshot = self._build(self.latest.version + 1, session)
-            except Exception:
-                log.exception("no snapshot could be made")
-                snapshot = None
-            if snapshot is not None:
-                with self._condition:
-                    self.latest = snapshot
-                    self._condition.notify_all()
-                self.listeners.call(snapshot)
+                snapshot = self._build(version, session)
+            except Exception as error:
+                failure = describe_error("Updating the page", error)
+                snapshot = replace(self.latest, version=version, read_failure=failure)
+            with self._condition:
+                self.latest = snapshot
+                self._condition.notify_all()
+            self.listeners.call(snapshot)
             with self._condition:
                 self._published = requested
                 self._condition.notify_all()

@@ -1,9 +1,11 @@
 """Reads what a session's files contain, for the panels. Nothing is cached but what would be read again the same."""
 
+import contextlib
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from functools import partial
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -13,7 +15,7 @@ from slviewer.calibration.observe import Observation
 from slviewer.calibration.pixelwise import PixelwiseModel
 from slviewer.calibration.splined.model import SplinedModel
 from slviewer.calibration.stereo import StereoModel
-from slviewer.errors import InputError, SessionError
+from slviewer.errors import DamagedError, InputError, SessionError
 from slviewer.fringe.presets import PRESETS
 from slviewer.pipeline.calibration_verdict import load_last_verdict
 from slviewer.pipeline.capture import DEFAULT_PATTERNS
@@ -38,6 +40,7 @@ from slviewer.session.names import natural_key
 from slviewer.session.store import Session
 from slviewer.target.board import Board
 from slviewer.wizard.export_files import list_exports
+from slviewer.wizard.notices import describe_error
 from slviewer.wizard.planner import Planner
 from slviewer.wizard.pose_plan import PlanInput, PoseFeatures, PosePlan
 from slviewer.wizard.result_views import merge_view
@@ -55,6 +58,8 @@ from slviewer.wizard.surfaces import list_nominals
 from slviewer.wizard.tasks import missing_for_splined
 
 MOST_CACHED = 500
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -86,8 +91,9 @@ class SessionReader:
         self._cache: dict[Any, Any] = {}
         self._lock = threading.Lock()
         self._thumbnails: dict[str, bytes] = {}
-        self._unreadable: dict[tuple[str, str], str] = {}
+        self._unreadable: dict[tuple[str, str, str], str] = {}  # by name, content hash and target
         self._features: dict[tuple[str, str], PoseFeatures] = {}  # of poses that are not judged yet
+        self._faults: list[str] = []  # what could not be read this time
 
     def add_thumbnail(self, capture: Capture, jpeg: bytes) -> None:
         """Store the thumbnail of a capture."""
@@ -105,14 +111,16 @@ class SessionReader:
     def add_unreadable(self, capture: Capture, why: str) -> None:
         """Store why a pose cannot be evaluated, so that it is not tried again."""
         with self._lock:
-            self._unreadable[capture.hash, self.target()] = why
+            self._unreadable[capture.name, capture.hash, self.target()] = why
 
     def target(self) -> str:
         """Return the board's notation: as chosen, else that of the calibration or of the poses; empty where unknown."""
         decided = self.session.decision("target")
         if decided:
             return str(decided)
-        stereo = load_stereo_if_complete(self.session)
+        stereo = None
+        with contextlib.suppress(SessionError):  # a damaged calibration, which `read` names
+            stereo = load_stereo_if_complete(self.session)
         if stereo is not None and stereo.board:
             return stereo.board
         return next((str(c.meta["board"]) for c in self.session.captures("calibration") if c.meta.get("board")), "")
@@ -127,7 +135,7 @@ class SessionReader:
 
     def needs_judging(self, capture: Capture, target: str) -> bool:
         """Whether this is a target pose whose features were not read with this target yet."""
-        if capture.role != "calibration" or not target or (capture.hash, target) in self._unreadable:
+        if capture.role != "calibration" or not target or (capture.name, capture.hash, target) in self._unreadable:
             return False
         return self._load_judgement(capture, target) is None
 
@@ -148,13 +156,15 @@ class SessionReader:
         return tuple(float(exposure) for exposure in self.session.decision("exposures") or ())
 
     def read(self, rig: RigView, focal_px: float | None) -> SessionView:
-        """Read the session's current state.
+        """Read the session's current state; what is damaged is missing from it, and named in its `faults`.
 
         `rig` has the devices' sizes until there are poses, `focal_px` is its lens's nominal focal length.
         """
         session, target = self.session, self.target()
-        captures = {capture.name: capture for capture in session.captures()}
-        calibration = self._read_calibration(captures)
+        sound, faults = session.read_captures()
+        self._faults = list(faults.values())
+        captures = {capture.name: capture for capture in sound}
+        calibration = self._attempt("the calibration", lambda: self._read_calibration(captures), None)
         models = calibration.models if calibration else ()
         hashes = {name: capture.hash for name, capture in captures.items()}
         for name in (f"calibration/{model}" for model in models):
@@ -165,9 +175,9 @@ class SessionReader:
         inputs = _Inputs(captures, session.decision("names") or {}, hashes, factors)
         poses, plan, pending = self._read_poses(captures, target, calibration, rig, focal_px)
         verifications = self._read_verifications(inputs)
-        verdict = load_last_verdict(session)
+        verdict = self._attempt("the verdict", lambda: load_last_verdict(session), None)
         of_calibration = calibration is not None and _is_verdict_of(verdict, self._load_meta("calibration/stereo"))
-        merges = [name for name in self._list_results("merge/") if set(self._load_meta(name)["scans"]) <= set(captures)]
+        merges = self._read_merges(inputs)
         return SessionView(
             folder=session.folder,
             target=target,
@@ -182,9 +192,9 @@ class SessionReader:
             verifications=verifications,
             distances=tuple(centre_spacings(verifications)),
             scans=tuple(self._read_scan(c, inputs) for c in captures.values() if c.role == "scan"),
-            merge=self._read_merge(merges[-1], inputs) if merges else None,
+            merge=merges[-1] if merges else None,
             merges=len(merges),
-            measurements=self._read_measurements(inputs),
+            measurements=self._attempt("the measurements", lambda: self._read_measurements(inputs), ()),
             deleted_measurements=sum(name.startswith(f"{MEASUREMENTS}-") for name in session.deleted_results()),
             nominals=list_nominals(session.folder),
             exports=list_exports(session),
@@ -192,7 +202,16 @@ class SessionReader:
             is_linear=self.levels() is not None,
             deleted_poses=tuple(session.deleted_captures("calibration")),
             deleted_scans=tuple(session.deleted_captures("scan")),
+            faults=tuple(dict.fromkeys(self._faults)),
         )
+
+    def _attempt(self, what: str, read: Callable[[], T], otherwise: T) -> T:
+        """Return what `read()` returns, or `otherwise` where that fails, which is one of the session's faults then."""
+        try:
+            return read()
+        except Exception as error:  # damaged files may make their reader fail in any way
+            self._faults.append(describe_error(f"Reading {what}", error))
+            return otherwise
 
     # poses
 
@@ -200,7 +219,10 @@ class SessionReader:
         """Return the `meta` of a pose's result; None unless it was made from these frames and this board."""
         if not self.session.has_result(f"poses/{capture.name}"):
             return None
-        meta = self._load_meta(f"poses/{capture.name}")
+        try:
+            meta = self._load_meta(f"poses/{capture.name}")
+        except DamagedError:  # the pose is evaluated again
+            return None
         return meta if meta["inputs"].get(capture.name) == capture.hash and meta["target"] == target else None
 
     def _read_poses(
@@ -225,8 +247,9 @@ class SessionReader:
                 if states[pose.name][0] in ("excluded", "refused"):
                     continue
                 if meta is not None:
-                    features[pose.name] = self._load_features(pose.name, meta["hash"])
-                elif early is not None:
+                    read = partial(self._load_features, pose.name, meta["hash"])
+                    early = self._attempt(f"the features of {pose.name}", read, None)
+                if early is not None:
                     features[pose.name] = early
             stereo = None if calibration is None or calibration.refused else calibration.stereo
             hashes = [(name, captures[name].hash) for name in features]
@@ -264,8 +287,8 @@ class SessionReader:
         excluded = self.session.excluded()
         if pose.name in excluded:
             return "excluded", excluded[pose.name]
-        if (pose.hash, target) in self._unreadable:
-            return "refused", self._unreadable[pose.hash, target]
+        if (pose.name, pose.hash, target) in self._unreadable:
+            return "refused", self._unreadable[pose.name, pose.hash, target]
         if meta is None:
             return "judging", ""
         if meta["refused"]:
@@ -348,17 +371,23 @@ class SessionReader:
 
     def _read_verifications(self, inputs: _Inputs) -> tuple[VerificationView, ...]:
         """Read the verifications of existing captures, with whether they are stale."""
-        return tuple(
-            read_verification(name, meta, str(inputs.labels.get(name, name)), not inputs.is_fresh(meta))
-            for result in self._list_results("verify/")
-            if (name := result.removeprefix("verify/")) in inputs.captures
-            for meta in (self._load_meta(result),)
-        )
+
+        def read(result: str) -> VerificationView | None:
+            """Read one verification by its result name; None where its capture is gone."""
+            name, meta = result.removeprefix("verify/"), self._load_meta(result)
+            if name not in inputs.captures:
+                return None
+            return read_verification(name, meta, str(inputs.labels.get(name, name)), not inputs.is_fresh(meta))
+
+        views = [self._attempt(name, partial(read, name), None) for name in self._list_results("verify/")]
+        return tuple(view for view in views if view is not None)
 
     def _read_scan(self, capture: Capture, inputs: _Inputs) -> ScanView:
         """Return the view of a scan capture: its label, and the figures and staleness of its cloud."""
         result = f"clouds/{capture.name}"
-        meta = self._load_meta(result) if self.session.has_result(result) else {}
+        meta: dict[str, Any] = {}
+        if self.session.has_result(result):
+            meta = self._attempt(result, lambda: self._load_meta(result), meta)
         depths = meta.get("depth_mm")
         return ScanView(
             name=capture.name,
@@ -375,12 +404,20 @@ class SessionReader:
             thumbnail=self._thumbnails.get(capture.hash, b""),
         )
 
-    def _read_merge(self, result: str, inputs: _Inputs) -> MergeView:
-        """Read the view of a merge by its result name, with whether it is stale."""
-        meta = self._load_meta(result)
-        stale = not inputs.is_fresh(meta)
-        name = result.removeprefix("merge/")
-        return self._get_cached(("merge", meta["hash"], stale), lambda: merge_view(name, meta, stale))  # type: ignore[no-any-return]
+    def _read_merges(self, inputs: _Inputs) -> list[MergeView]:
+        """Read the merges whose scans all exist, with whether they are stale, in the order they were made."""
+
+        def read(result: str) -> MergeView | None:
+            """Read one merge by its result name; None where a scan of it is gone."""
+            meta = self._load_meta(result)
+            if not set(meta["scans"]) <= set(inputs.captures):
+                return None
+            stale = not inputs.is_fresh(meta)
+            name = result.removeprefix("merge/")
+            return self._get_cached(("merge", meta["hash"], stale), lambda: merge_view(name, meta, stale))  # type: ignore[no-any-return]
+
+        views = [self._attempt(name, partial(read, name), None) for name in self._list_results("merge/")]
+        return [view for view in views if view is not None]
 
     def _read_measurements(self, inputs: _Inputs) -> tuple[Measurement, ...]:
         """Read all measurements, in the order they were made; stale as ``pipeline.measurements`` defines it."""

@@ -289,6 +289,7 @@ class SessionView:
     deleted_scans: tuple[str, ...] = ()
     is_linear: bool = False  # whether patterns are corrected by the measured table of grey levels
     exposures_ms: tuple[float, ...] = ()  # of every capture; empty: a single one, the camera's
+    faults: tuple[str, ...] = ()  # what is damaged, or no capture, and missing here, with the remedy
 
     @property
     def enough(self) -> bool:
@@ -336,7 +337,7 @@ class Snapshot:
     preflight: Preflight | None = None  # result of the last check of the rig in use
     live: LiveView | None = None  # None while no live scan runs
     merge_failure: str = ""  # why the last merge was refused, or failed
-    read_failure: str = ""  # why the session's files could not be read just now
+    read_failure: str = ""  # why this is not the current state: files that could not be read just now
     preparing: float | None = None  # share of the kernels compiled in the background; None while none are
 
     @property
