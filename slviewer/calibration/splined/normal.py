@@ -7,13 +7,17 @@ import numba
 import numpy as np
 
 from slviewer.calibration.splined.board_shape import HEIGHT_TERMS
-from slviewer.calibration.splined.residuals import CAMERA, DENSE, HEIGHT, OFFSET, PROJECTOR, feature_row, sample_row
+from slviewer.calibration.splined.residuals import CAMERA, DENSE, HEIGHT, OFFSET, feature_row, sample_row
 from slviewer.calibration.splined.unknowns import RIG, State
 from slviewer.geometry.jit import kernel
 
 MAX_LANES = 4
 """Largest number of matrices that threads fill in parallel; each has the size of the whole."""
 _ROWS_ADDED = 128  # of two matrices at a time
+FIELD = 16
+CAMERA_FIELD, PROJECTOR_FIELD, ROW = DENSE, DENSE + 2 * FIELD, DENSE + 4 * FIELD
+"""Coefficients of one component of a field that reach a place; index of each field's first entry in a whole row, behind
+the dense part; and the row's length."""
 
 
 class PoseData(NamedTuple):
@@ -85,10 +89,11 @@ def normal_equations(
         [layout.height, layout.offsets, layout.rig, layout.camera_field, layout.projector_field, layout.size], np.int64
     )
     model = state.rig, state.R_board, state.t_board, state.heights, state.offsets
+    order = _sort_by_cell(state, data)
     with ThreadPoolExecutor(len(shares)) as threads:
         list(
             threads.map(
-                lambda poses, A, b: _accumulate(*model, data, *residuals, *weights, at, poses, A, b),
+                lambda poses, A, b: _accumulate(*model, data, *residuals, *weights, at, order, poses, A, b),
                 shares, matrices, right,
             )
         )  # fmt: skip
@@ -97,6 +102,15 @@ def normal_equations(
         for other in matrices[1:]:
             matrices[0][upper] += other[upper]
     return matrices[0], right.sum(0)
+
+
+def _sort_by_cell(state: State, data: PoseData) -> np.ndarray:
+    """Indices (m,) of the samples, pose by pose, with those in the same cell of both fields one after another."""
+    keys = []
+    for device, px in ((state.rig.projector, data.projector_px), (state.rig.camera, data.sample_px)):
+        cells = np.array(device.coefficients.shape[:0:-1]) - 3
+        keys += list(np.nan_to_num((px + 0.5) * cells / device.size).astype(np.int64).T)
+    return np.lexsort([*keys, np.repeat(np.arange(len(data.sample_from) - 1), np.diff(data.sample_from))])
 
 
 def _split_poses(poses: int) -> list[np.ndarray]:
@@ -122,11 +136,16 @@ def _predict(rig, R, t, heights, offsets, data, poses, features, samples):
 
 
 @kernel()
-def _accumulate(rig, R, t, heights, offsets, data, feature_r, sample_r, feature_w, sample_w, at, poses, A, b):
-    """Add the observations of some ``poses`` to the normal matrix A (upper triangle) and the right-hand side b."""
+def _accumulate(rig, R, t, heights, offsets, data, feature_r, sample_r, feature_w, sample_w, at, order, poses, A, b):
+    """Add the observations of some ``poses`` to the normal matrix A (upper triangle) and the right-hand side b.
+
+    Samples are taken in ``order`` (m,); those in the same cells of both fields are summed before they are added to A.
+    """
     work = allocate_workspace()
-    row, by_field = np.zeros((2, DENSE)), np.zeros((2, 2))
-    columns = np.empty(DENSE, np.int64)  # of a row's entries, in the order of the vector
+    row, by_field, cells = np.zeros((2, ROW)), np.zeros((2, 2)), np.zeros(4, np.int64)
+    rows, w, r = np.zeros((4, ROW)), np.zeros(4), np.zeros(4)  # of two observations, added at once
+    S, s = np.zeros((ROW, ROW)), np.zeros(ROW)
+    columns = np.zeros(ROW, np.int64)  # of a row's entries, in the order of the vector
     for c in range(HEIGHT_TERMS):
         columns[HEIGHT + c] = at[0] + c
     for c in range(RIG):
@@ -135,109 +154,96 @@ def _accumulate(rig, R, t, heights, offsets, data, feature_r, sample_r, feature_
         for c in range(HEIGHT):
             columns[c] = 6 * i + c
         for n in range(data.feature_from[i], data.feature_from[i + 1]):
-            w0, w1 = feature_w[n, 0], feature_w[n, 1]
-            if w0 > 0.0 or w1 > 0.0:
-                f, r = data.feature[n], feature_r[n]
+            if feature_w[n, 0] > 0.0 or feature_w[n, 1] > 0.0:
+                f = data.feature[n]
                 _, _, ci, cj = feature_row(rig, R[i], t[i], heights, data.frame, data.points[f], offsets[f], work, row)
                 columns[OFFSET], columns[OFFSET + 1] = at[1] + 2 * f, at[1] + 2 * f + 1
-                _add_dense(A, b, row, columns, PROJECTOR, w0, w1, r)
-                _add_field(A, b, row, columns, PROJECTOR, w0, w1, r, rig.camera, ci, cj, work.camera_basis, at[3])
+                _set_field_columns(columns, CAMERA_FIELD, rig.camera, ci, cj, at[3])
+                for k in range(2):  # u's coefficients are in row u alone, v's in row v
+                    _fill_field(row, CAMERA_FIELD + k * FIELD, work.camera_basis, 1.0 - k, float(k))
+                _set_rows(rows, w, r, 0, row, feature_w[n], feature_r[n])
+                _add_rows(S, s, rows, w, r, PROJECTOR_FIELD)
+                _move_sums(S, s, columns, PROJECTOR_FIELD, A, b)
         columns[OFFSET], columns[OFFSET + 1] = at[1], at[1] + 1  # a sample's row has zeros there
-        for n in range(data.sample_from[i], data.sample_from[i + 1]):
-            w0, w1 = sample_w[n, 0], sample_w[n, 1]
-            if w0 > 0.0 or w1 > 0.0:
-                px, r = data.sample_px[n], sample_r[n]
+        cells[:] = -1
+        first = 0
+        for n in order[data.sample_from[i] : data.sample_from[i + 1]]:
+            if sample_w[n, 0] > 0.0 or sample_w[n, 1] > 0.0:
+                px = data.sample_px[n]
                 _, _, ci, cj, pi, pj = sample_row(
                     rig, R[i], t[i], heights, data.frame, px[0], px[1], work, row, by_field
                 )
-                _add_dense(A, b, row, columns, DENSE, w0, w1, r)
-                _add_field(A, b, row, columns, DENSE, w0, w1, r, rig.projector, pi, pj, work.projector_basis, at[4])
-                _add_through(A, b, row, columns, w0, w1, r, rig, ci, cj, pi, pj, by_field, work, at)
+                if ci != cells[0] or cj != cells[1] or pi != cells[2] or pj != cells[3]:
+                    _add_rows(S, s, rows, w, r, ROW)
+                    _move_sums(S, s, columns, ROW, A, b)
+                    first = 0
+                    cells[0], cells[1], cells[2], cells[3] = ci, cj, pi, pj
+                    _set_field_columns(columns, CAMERA_FIELD, rig.camera, ci, cj, at[3])
+                    _set_field_columns(columns, PROJECTOR_FIELD, rig.projector, pi, pj, at[4])
+                for k in range(2):  # both rows look through the camera's field
+                    _fill_field(row, CAMERA_FIELD + k * FIELD, work.camera_basis, by_field[0, k], by_field[1, k])
+                    _fill_field(row, PROJECTOR_FIELD + k * FIELD, work.projector_basis, 1.0 - k, float(k))
+                _set_rows(rows, w, r, first, row, sample_w[n], sample_r[n])
+                if first == 2:
+                    _add_rows(S, s, rows, w, r, ROW)
+                first = 2 - first
+        _add_rows(S, s, rows, w, r, ROW)
+        _move_sums(S, s, columns, ROW, A, b)
 
 
 @kernel()
-def _add_dense(A, b, row, columns, length, w0, w1, r):
-    """Rows u and v against themselves."""
-    r0, r1 = (r[0] if w0 > 0.0 else 0.0), (r[1] if w1 > 0.0 else 0.0)
-    for a in range(length):
-        p, q = w0 * row[0, a], w1 * row[1, a]
-        if p == 0.0 and q == 0.0:
-            continue
-        target = A[columns[a]]
-        b[columns[a]] += p * r0 + q * r1
-        for c in range(a, length):
-            target[columns[c]] += p * row[0, c] + q * row[1, c]
-
-
-@kernel()
-def _add_field(A, b, row, columns, length, w0, w1, r, device, i, j, basis, start):
-    """Add the field of the device that observes the residual: u's coefficients are in row u alone, v's in row v."""
+def _set_field_columns(columns, first, device, i, j, start):
+    """Fill in the columns of the coefficients of both components that reach the cell (i, j) of a device's field."""
     stride = device.coefficients.shape[2]
     knots = stride * device.coefficients.shape[1]
     for k in range(2):
-        w = w0 if k == 0 else w1
-        if not w > 0.0:
-            continue
-        first = start + k * knots + j * stride + i
-        for a in range(length):
-            value = w * row[k, a]
-            if value != 0.0:
-                target = A[columns[a]]
-                for m in range(4):
-                    scaled = value * basis[2, m]
-                    at = first + m * stride
-                    for n in range(4):
-                        target[at + n] += scaled * basis[0, n]
         for m in range(4):
             for n in range(4):
-                one = first + m * stride + n
-                value = w * basis[2, m] * basis[0, n]
-                b[one] += value * r[k]
-                target = A[one]
-                for c in range(m, 4):
-                    scaled = value * basis[2, c]
-                    at = first + c * stride
-                    for d in range(n if c == m else 0, 4):
-                        target[at + d] += scaled * basis[0, d]
+                columns[first + k * FIELD + 4 * m + n] = start + k * knots + (j + m) * stride + i + n
 
 
 @kernel()
-def _add_through(A, b, row, columns, w0, w1, r, rig, ci, cj, pi, pj, by_field, work, at):
-    """The camera's field, through which both of a sample's rows look; against itself and the projector's field."""
-    basis, other = work.camera_basis, work.projector_basis
-    stride, across = rig.camera.coefficients.shape[2], rig.projector.coefficients.shape[2]
-    knots, others = stride * rig.camera.coefficients.shape[1], across * rig.projector.coefficients.shape[1]
-    r0, r1 = (r[0] if w0 > 0.0 else 0.0), (r[1] if w1 > 0.0 else 0.0)
-    for k in range(2):  # component of the camera's field
-        p, q = w0 * by_field[0, k], w1 * by_field[1, k]
-        first = at[3] + k * knots + cj * stride + ci
-        for a in range(DENSE):
-            value = p * row[0, a] + q * row[1, a]
-            if value != 0.0:
-                target = A[columns[a]]
-                for m in range(4):
-                    scaled = value * basis[2, m]
-                    for n in range(4):
-                        target[first + m * stride + n] += scaled * basis[0, n]
-        pull = p * r0 + q * r1
-        for m in range(4):
-            for n in range(4):
-                one = first + m * stride + n
-                value = basis[2, m] * basis[0, n]
-                b[one] += pull * value
-                target = A[one]
-                for other_k in range(k, 2):
-                    coupling = (p * by_field[0, other_k] + q * by_field[1, other_k]) * value
-                    start = at[3] + other_k * knots + cj * stride + ci
-                    for c in range(m if other_k == k else 0, 4):
-                        scaled = coupling * basis[2, c]
-                        for d in range(n if (other_k == k and c == m) else 0, 4):
-                            target[start + c * stride + d] += scaled * basis[0, d]
-                for other_k in range(2):
-                    coupling = (p if other_k == 0 else q) * value
-                    if coupling != 0.0:
-                        start = at[4] + other_k * others + pj * across + pi
-                        for c in range(4):
-                            scaled = coupling * other[2, c]
-                            for d in range(4):
-                                target[start + c * across + d] += scaled * other[0, d]
+def _fill_field(row, first, basis, by_u, by_v):
+    """Fill in the derivatives of u and v by one component's coefficients; ``by_u``, ``by_v``: by its displacement."""
+    for m in range(4):
+        for n in range(4):
+            value = basis[2, m] * basis[0, n]
+            row[0, first + 4 * m + n] = by_u * value
+            row[1, first + 4 * m + n] = by_v * value
+
+
+@kernel()
+def _set_rows(rows, w, r, first, row, weight, residual):
+    """Fill in rows ``first`` and ``first`` + 1 with the two of an observation, their weights and residuals."""
+    for k in range(2):
+        rows[first + k] = row[k]
+        w[first + k] = weight[k]
+        r[first + k] = residual[k] if weight[k] > 0.0 else 0.0
+
+
+@kernel(fastmath=True)
+def _add_rows(S, s, rows, w, r, length):
+    """Add the weighted products of four rows with themselves to S (upper triangle), and with the residuals to s.
+
+    Then the weights are set to zero.
+    """
+    for a in range(length):
+        p0, p1, p2, p3 = w[0] * rows[0, a], w[1] * rows[1, a], w[2] * rows[2, a], w[3] * rows[3, a]
+        s[a] += p0 * r[0] + p1 * r[1] + p2 * r[2] + p3 * r[3]
+        target = S[a, a:length]
+        u0, u1, u2, u3 = rows[0, a:length], rows[1, a:length], rows[2, a:length], rows[3, a:length]
+        for c in range(target.size):
+            target[c] += p0 * u0[c] + p1 * u1[c] + p2 * u2[c] + p3 * u3[c]
+    w[:] = 0.0
+
+
+@kernel()
+def _move_sums(S, s, columns, length, A, b):
+    """Add S (upper triangle) and s to A and b, each entry to its column, and set them to zero."""
+    for a in range(length):
+        target, source, column = A[columns[a]], S[a, a:length], columns[a:length]
+        b[columns[a]] += s[a]
+        s[a] = 0.0
+        for c in range(source.size):
+            target[column[c]] += source[c]
+        source[:] = 0.0
