@@ -78,13 +78,13 @@ def _serve_projector_page(port: int) -> Iterator["SetUp"]:
 def _connect_page(port: int, ended: ExitStack) -> "Channel":
     """Serve the projector page and return the channel to it, once it is ready. Raises DeviceError on timeout."""
     from slviewer.devices.channel import Channel
-    from slviewer.server.projector_page import PATH, serve_projector
-    from slviewer.server.secure import serve
+    from slviewer.server.projector_page import serve_projector
+    from slviewer.server.secure import Serving, serve
 
-    channel, server = Channel(), serve("127.0.0.1", port, label="slviewer")
+    channel, server = Channel(), serve(Serving(port=port), label="slviewer")
     ended.callback(server.stop)
     serve_projector(server, channel)
-    terminal.print_message(f"Open this on the projector's screen, full screen: {server.link(PATH)}")
+    terminal.print_message(f"Open this on the projector's screen, full screen: {server.link('project')}")
     reported = ""
     for _ in range(int(PAGE_PATIENCE_S)):
         standing = channel.wait_ready(1.0)

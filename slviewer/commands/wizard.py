@@ -11,6 +11,10 @@ def wizard(
     rig: str = "",
     host: str = "127.0.0.1",
     port: int = 8080,
+    name: tuple[str, ...] = (),
+    tls: bool = False,
+    tls_files: tuple[Path, Path] | None = None,
+    token_file: Path | None = None,
     no_browser: bool = False,
 ) -> Callable[[], None]:
     """Start the wizard in the browser: from an unknown rig to a merged mesh. Plain `slviewer` does the same.
@@ -21,13 +25,19 @@ def wizard(
             session remembers, else the simulated one.
         host: Address to serve at; any other than the default lets others on the network try.
         port: Port to serve at; 0 takes any free one.
+        name: Further host names under which browsers reach this server, such as scanner.lab, behind a proxy.
+        tls: Encrypt, with a certificate that slviewer makes; its fingerprint is printed.
+        tls_files: Encrypt, with this certificate and this key (PEM files).
+        token_file: TOML file with the tokens of the links, which so stay the same; made if it does not exist.
         no_browser: Print the address, and open no browser.
     """
 
     def start() -> None:
         """Run the wizard in the browser."""
         from slviewer.gui.app import run
+        from slviewer.server.secure import Serving
 
-        run(session, rig, host, port, open_browser=not no_browser)
+        serving = Serving(host, port, name, tls, tls_files, token_file)
+        run(session, rig, serving, open_browser=not no_browser)
 
     return start

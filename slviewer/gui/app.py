@@ -1,10 +1,14 @@
 """Starts the wizard: the operator, the server, and one thread that draws."""
 
+import contextlib
 import logging
+import os
 import signal
+import tempfile
 import threading
 import time
 import webbrowser
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
@@ -14,14 +18,17 @@ import viser
 
 from slviewer.devices.channel import Channel, PageState
 from slviewer.errors import SlviewerError, UsageError
+from slviewer.gui.links import show_links
 from slviewer.gui.panel import PanelContext
 from slviewer.gui.scene import ViewerScene
 from slviewer.gui.shell import Shell, greet_viewer, notify
 from slviewer.gui.viewpoints import FIELD_OF_VIEW, OVERVIEW, Viewpoints
 from slviewer.pipeline.rig_choice import set_up
 from slviewer.pipeline.rig_presets import load_rig
+from slviewer.server import viser_internals
+from slviewer.server.access import ONE_TIME_SECONDS
 from slviewer.server.projector_page import serve_projector
-from slviewer.server.secure import SafeServer, serve
+from slviewer.server.secure import SafeServer, Serving, serve
 from slviewer.server.viewers import Viewers
 from slviewer.session.store import Session
 from slviewer.wizard.notices import describe_error
@@ -42,19 +49,19 @@ class App:
     def __init__(
         self,
         operator: Operator,
-        host: str = "127.0.0.1",
-        port: int = 8080,
+        serving: Serving,
         *,
         channel: Channel | None = None,
-        **options: Any,
+        print_links: Callable[[SafeServer], None] = lambda _: None,
     ) -> None:
         """Serve `operator`, and the projector page if `channel` is given, the one that its rigs are set up with.
 
-        `options` are those of `serve`. Raises SlviewerError where the address cannot be served.
+        `print_links` is called when the links were replaced. Raises SlviewerError where it cannot be served.
         """
         self.operator = operator
         self.channel = channel
-        self.server: SafeServer = serve(host, port, label="slviewer", **options)
+        self._print_links = print_links
+        self.server: SafeServer = serve(serving, label="slviewer")
         try:
             if channel is not None:
                 serve_projector(self.server, channel)
@@ -97,6 +104,7 @@ class App:
             self._executor,
             partial(Viewers, page),
             self._get_page_state,
+            self._show_links,
         )
         snapshot = operator.snapshot()
         self._notified = snapshot.notices[-1].number if snapshot.notices else 0
@@ -178,16 +186,36 @@ class App:
         return None if self.channel is None else self.channel.page_state()
 
     def _greet_client(self, client: viser.ClientHandle) -> None:
-        """Show a browser that connected by the view-only link that it may only watch."""
-        if self.server.role(client.client_id) == "viewer":
+        """Show a browser that may only watch that it may, and an operator's what only operators see."""
+        if self.server.role(client.client_id) == "operate":
+            viser_internals.send_private_values(self.server.viser, client.client_id)
+        else:
             greet_viewer(client)
+
+    def _show_links(self, client: viser.ClientHandle) -> None:
+        """Show the links in the browser that requested them."""
+
+        def replace() -> None:
+            """Replace all links, and print the new ones."""
+            try:
+                self.server.renew_links(client.client_id)
+                self.operator.notify("info", "The links were replaced: pages opened by the old ones are closed")
+            except OSError as error:
+                file = self.server.serving.token_file
+                self.operator.notify(
+                    "error",
+                    f"The links were replaced, but {file} holds the old tokens, valid again after a restart "
+                    f"({error.strerror}): write new ones into it",
+                )
+            self._print_links(self.server)
+
+        show_links(client, self.server, replace)
 
 
 def run(
     session: Path | None = None,
     rig: str = "",
-    host: str = "127.0.0.1",
-    port: int = 8080,
+    serving: Serving | None = None,
     open_browser: bool = True,
 ) -> None:
     """Serve the wizard until Ctrl-C. `rig` as in `rig_choice`; empty: the session's, else the simulated one.
@@ -200,23 +228,36 @@ def run(
         remembered = operator.session is not None and operator.session.decision("rig")
         if rig or not remembered:  # a remembered rig that is not connected now is not replaced by the simulated one
             _check_granted(operator, operator.choose_rig(rig_choice(rig or "simulated", operator.session)))
-        app = App(operator, host, port, channel=channel)
+        app = App(operator, serving or Serving(), channel=channel, print_links=print_links)
         preparation = Preparation(operator.set_preparing)
         preparation.start()
-        try:
-            print(f"slviewer is ready: {app.server.url}")
-            print(f"view-only link:    {app.server.view_url}")
-            print(f"projector page:    {app.server.link('/projector')}", flush=True)
-            if not app.server.loopback:
-                print("The connection is not encrypted: use a network that you trust.", flush=True)
-            if open_browser:
-                _open_browser(app.server.url)
-            _wait_for_stop()
-        except KeyboardInterrupt:
-            print("\nslviewer has stopped; the session is saved.")
-        finally:
-            preparation.close()
-            app.close()
+        with contextlib.ExitStack() as ended:
+            ended.callback(app.close)
+            ended.callback(preparation.close)
+            try:
+                print_links(app.server)
+                if open_browser:
+                    ended.enter_context(_browser_opened(app.server))
+                _wait_for_stop()
+            except KeyboardInterrupt:
+                print("\nslviewer has stopped; the session is saved.")
+
+
+def print_links(server: SafeServer) -> None:
+    """Print the links of all roles, or, where their tokens are in a file, its path: the output may be logged."""
+    file = server.serving.token_file
+    if file is None:
+        print(f"slviewer is ready: {server.link()}")
+        print(f"view-only link:    {server.link('watch')}")
+        print(f"projector page:    {server.link('project')}")
+    else:
+        print(f"slviewer is ready: {server.origin}/#TOKEN, with the tokens operate, watch and project of {file}")
+    if server.certificate is None and not server.loopback:
+        print("The connection is not encrypted: use --tls, or a network that you trust.")
+    elif server.certificate is not None and server.certificate.self_made:
+        print("Browsers warn of the self-made certificate. Compare its SHA-256 fingerprint before you continue:")
+        print(f"  {server.certificate.fingerprint}")
+    print(end="", flush=True)
 
 
 def rig_choice(text: str, session: Session | None = None) -> dict[str, Any]:
@@ -247,10 +288,37 @@ def _check_granted(operator: Operator, granted: bool) -> None:
         raise SlviewerError(next(notice.text for notice in reversed(operator.notices()) if notice.level == "error"))
 
 
-def _open_browser(url: str) -> None:
-    """Open an address in the default browser without waiting; nothing happens where there is none."""
+@contextlib.contextmanager
+def _browser_opened(server: SafeServer) -> Iterator[None]:
+    """Open the wizard in the default browser without waiting; nothing happens where there is none.
+
+    The command line of a browser can be read by every user of the machine: it is given a file that this user alone can
+    read, which leads to a link that can be opened once. The file is in the home folder, as some browsers are kept from
+    all others, and removed once it is no longer needed.
+    """
     try:
         webbrowser.get()
-    except webbrowser.Error:
+        home = Path.home()
+        folder = tempfile.TemporaryDirectory(
+            prefix="slviewer-", dir=home if os.access(home, os.W_OK) else None, ignore_cleanup_errors=True
+        )
+    except (webbrowser.Error, OSError, RuntimeError):
+        yield
         return
-    threading.Thread(target=webbrowser.open, args=(url,), daemon=True).start()
+    with folder as place:
+        page = Path(place, "open.html")
+        link = server.one_time_link()
+        with os.fdopen(os.open(page, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w", encoding="utf-8") as file:
+            file.write(f'<!doctype html><meta charset="utf-8"><meta name="referrer" content="no-referrer">'
+                       f"<title>slviewer</title><script>location.replace({link!r})</script>")  # fmt: skip
+
+        def open_page() -> None:
+            """Open the page, and remove it when its link has been opened or is no longer valid."""
+            webbrowser.open(page.as_uri())
+            end = time.monotonic() + ONE_TIME_SECONDS
+            while server.access.is_pending(link.partition("#")[2]) and time.monotonic() < end:
+                time.sleep(0.5)
+            folder.cleanup()
+
+        threading.Thread(target=open_page, daemon=True).start()
+        yield

@@ -32,7 +32,7 @@ class PanelContext:
     `offer(path)` returns the address at which a file of the session is downloaded; `notify(level, text)` shows a
     notification in every browser; `go(key)` shows another step. `executor` runs one callback after the other.
     `projector_page()` returns the state of the projector page; None where none is served. `viewers(answered)` tracks
-    which browsers have drawn what they were sent.
+    which browsers have drawn what they were sent. `show_links(client)` shows the links in one browser.
     """
 
     gui: viser.GuiApi
@@ -46,6 +46,7 @@ class PanelContext:
     executor: Executor
     viewers: Callable[[Callable[[], None]], Viewers]
     projector_page: Callable[[], PageState | None] = lambda: None
+    show_links: Callable[[viser.ClientHandle], None] = lambda _: None
 
     @property
     def session(self) -> Session:

@@ -12,6 +12,7 @@ from slviewer.gui.panel import PanelContext
 from slviewer.gui.widgets import Html, Text, Tone, alert, coloured, paragraph, to_html
 from slviewer.pipeline.rig_choice import Choice
 from slviewer.pipeline.rig_presets import Preset, check_choice, presets
+from slviewer.server.viser_internals import make_private
 from slviewer.wizard.snapshot import RigView, SessionView, Snapshot
 
 SIMULATED: dict[str, dict[str, Any]] = {
@@ -45,6 +46,7 @@ class RigChoice:
             self._camera = gui.add_dropdown("Camera", tuple(self._cameras))
             self._camera.on_update(context.callback(self._draw_devices))
             self._source = gui.add_text("Camera ID", "", hint="Number of a webcam, file, address, or serial number")
+            make_private(self._source)  # it may hold a password
             self._projector = gui.add_dropdown("Projector", tuple(self._projectors))
             self._projector.on_update(context.callback(self._draw_devices))
             self._size = gui.add_text("Resolution", "", hint="For example 1920x1080; empty: that of its screen")
@@ -215,10 +217,10 @@ def _rig_html(rig: RigView) -> str:
 
 
 def _page_html(standing: Any) -> str:
-    """Describe the state of the projector page, and how to open it; without the token, which viewers must not get."""
+    """Describe the state of the projector page, and how to open it; viewers read this too, and may not."""
     if standing is None:
         return alert("This rig needs the projector page, which is not served here.", "error")
-    link = '<a href="/projector" target="_blank" rel="noopener">Open the projector page</a>'
-    how = f"{link} and move its window to the projector's screen; on another computer, use the link in the terminal."
+    link = '<a href="projector" target="_blank" rel="noopener">Open the projector page</a>'
+    how = f"{link} and move its window to the projector's screen; on another computer, open the link that Links shows."
     tone: Tone = {"waiting": "info", "refused": "warning", "ready": "good"}[standing.state]  # type: ignore[assignment]
     return alert(Html(f"Projector page: {to_html(standing.words)}" + ("" if tone == "good" else f"<br>{how}")), tone)

@@ -112,6 +112,8 @@ class Shell:
             context.button(
                 "Open session", lambda: context.operator.open_session(self._path.value), viser.Icon.FOLDER_OPEN
             )
+        links = gui.add_button("Links", icon=viser.Icon.LINK, color="gray", hint="For watching and for the projector")
+        links.on_click(lambda event: context.callback(partial(context.show_links, event.client), at_once=True)(event))
         with gui.add_folder("Messages", expand_by_default=True):
             self._busy = Text(gui)
             self._latest = Text(gui)
@@ -244,7 +246,7 @@ class Shell:
         self._autopilot_status.set(alert(snapshot.autopilot, "info") if snapshot.autopilot else "")
         latest = "".join(_notice_html(notice) for notice in reversed(snapshot.notices[-_MOST_NOTICES:]))
         # as high as a small screen leaves, so that the panel itself does not scroll
-        style = "max-height:max(6em, calc(100vh - 625px));overflow-y:auto;overflow-wrap:anywhere"
+        style = "max-height:max(6em, calc(100vh - 665px));overflow-y:auto;overflow-wrap:anywhere"
         self._latest.set(f'<div style="{style}">{latest or paragraph(coloured("No messages.", "dim"))}</div>')
 
     # requests

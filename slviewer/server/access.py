@@ -1,20 +1,37 @@
-"""Access rules: the right Host and Origin, and a cookie from a link that only the operator was given."""
+"""Access rules: the right Host and Origin, and for each role a token, a path of its own and a cookie for that path.
 
+A token is exchanged for a cookie once, at `/login`. Browsers send the cookies of a host to all its ports, but only to
+the paths that a cookie names: each role has a path that cannot be guessed, so that no other server on the machine is
+sent the cookie, and the cookies of two roles never meet.
+"""
+
+import hashlib
 import hmac
 import ipaddress
 import re
 import secrets
 import socket
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
 from http import HTTPStatus
-from typing import Literal
+from typing import Literal, get_args
 
 from websockets.datastructures import Headers
 
 from slviewer.errors import UsageError
 
-Role = Literal["operator", "viewer"]
+Role = Literal["operate", "watch", "project"]
+"""Who may do what: operate the wizard, watch it, or be the projector page."""
+ROLES: tuple[Role, ...] = get_args(Role)
 
+ONE_TIME_SECONDS = 120.0
+"""How long a one-time token may be exchanged."""
+WRONG_TOKENS, WRONG_TOKENS_SECONDS = 10, 60.0
+"""Wrong tokens from one address within this time, after which it is refused."""
+_MOST_ADDRESSES = 1024
 _TOKEN = re.compile(r"[A-Za-z0-9_-]{16,256}")
+_PATH = re.compile(r"(/[a-z]+-[0-9a-f]{16})(/.*)?")
 
 
 class Refusal(Exception):
@@ -37,52 +54,149 @@ class MessageRefused(Exception):
         self.correct = correct
 
 
-class Access:
-    """The rules of one server at one port.
+@dataclass(frozen=True)
+class Grant:
+    """What the token of one role opens: `path`, without a final slash, to whoever sends the cookie `value`.
 
-    `names` are further host names, `name` or `name:port`, under which this server is reached (behind a proxy, say); the
-    address that a connection came in at is always one, and so is the machine's own name unless it serves itself alone.
+    Path and value are derived from the token, so that browsers stay logged in when a server with the same tokens
+    starts again. `chosen`: a person chose the token, which may therefore be guessed.
     """
 
-    def __init__(self, port: int, token: str | None, view_token: str | None, names: tuple[str, ...] = ()) -> None:
+    role: Role
+    token: str
+    port: int
+    chosen: bool = False
+
+    @property
+    def path(self) -> str:
+        """Path of the role's page; no secret, but not to be guessed by other servers."""
+        return f"/{self.role}-{self._derive('path')[:16]}"
+
+    @property
+    def cookie_name(self) -> str:
+        """Name of the cookie, with port and role: browsers do not tell the cookies of two ports apart."""
+        return f"slviewer_{self.port}_{self.role}"
+
+    @property
+    def value(self) -> str:
+        """Value of the cookie, from which the token cannot be computed."""
+        return self._derive("cookie")
+
+    def set_cookie(self, secure: bool) -> str:
+        """Return the Set-Cookie header: for scripts and other sites invisible, for this browser session."""
+        attributes = "; HttpOnly; SameSite=Strict" + ("; Secure" if secure else "")
+        return f"{self.cookie_name}={self.value}; Path={self.path}{attributes}"
+
+    def accepts(self, headers: Headers) -> bool:
+        """Whether one of the request's cookies is this one, compared in constant time."""
+        parts = (part.strip().partition("=") for header in headers.get_all("Cookie") for part in header.split(";"))
+        return any(name == self.cookie_name and _is_equal(value, self.value) for name, _, value in parts)
+
+    def _derive(self, purpose: str) -> str:
+        """Return the HMAC of port, role and purpose with the token as its key, in hexadecimal digits."""
+        return hmac.new(self.token.encode(), f"{purpose} {self.role} {self.port}".encode(), hashlib.sha256).hexdigest()
+
+
+class Access:
+    """The rules of one server at one port. Every method may be called from any thread.
+
+    `tokens` by role are fixed ones; the others are random. `names` are further host names, `name` or `name:port`,
+    under which this server is reached (behind a proxy, say); the address that a connection came in at is always one,
+    and so is the machine's own name unless it serves itself alone. `tls`: the server itself encrypts.
+    """
+
+    def __init__(
+        self,
+        port: int,
+        tokens: Mapping[Role, str] | None = None,
+        names: tuple[str, ...] = (),
+        tls: bool = False,
+    ) -> None:
         self.port = port
-        self.token = _check_token(token)
-        self.view_token = _check_token(view_token)
-        if hmac.compare_digest(self.token, self.view_token):
-            raise UsageError("The token for watching is the operator's: choose two different ones.")
+        self.tls = tls
         self.names = frozenset(name.lower() for name in names)
-        # Cookies are shared by all ports of a host: two servers on one machine must not overwrite each other's.
-        self.cookie_name = f"slviewer_{port}"
+        for token in (tokens or {}).values():
+            if not _TOKEN.fullmatch(token):
+                raise UsageError(
+                    "A token has 16 or more letters, digits, - and _: leave it out and slviewer makes one."
+                )
+        if len(set((tokens or {}).values())) < len(tokens or {}):
+            raise UsageError("Two roles have the same token: choose different ones.")
+        self._one_time: dict[str, float] = {}
+        self._wrong: dict[str, list[float]] = {}
+        self.grants: dict[Role, Grant] = {}
+        self.renew(tokens or {})
 
-    def role_of(self, token: str) -> Role | None:
-        """The role that a token belongs to, or None, compared in constant time."""
-        given = token.encode("utf-8", "surrogateescape")
-        operator = hmac.compare_digest(given, self.token.encode())
-        viewer = hmac.compare_digest(given, self.view_token.encode())
-        return "operator" if operator else "viewer" if viewer else None
+    def renew(self, tokens: Mapping[Role, str] | None = None) -> None:
+        """Replace all tokens, by those given, else random ones: the links given out so far open nothing any more."""
+        self._one_time = {}
+        self.grants = {
+            role: Grant(role, tokens[role], self.port, True)
+            if tokens and role in tokens
+            else Grant(role, secrets.token_urlsafe(24), self.port)
+            for role in ROLES
+        }
 
-    def role(self, headers: Headers) -> Role:
-        """The role of the request's cookie; raises Refusal without a valid one."""
-        for header in headers.get_all("Cookie"):
-            for part in header.split(";"):
-                name, _, value = part.strip().partition("=")
-                if name == self.cookie_name and (role := self.role_of(value)) is not None:
-                    return role
+    def issue_one_time_token(self) -> str:
+        """Return a token that the operator's browser can exchange once, within ONE_TIME_SECONDS."""
+        token = secrets.token_urlsafe(24)
+        self._one_time[token] = time.monotonic() + ONE_TIME_SECONDS
+        return token
+
+    def is_pending(self, token: str) -> bool:
+        """Whether a one-time token has not been exchanged yet."""
+        return time.monotonic() < self._one_time.get(token, 0.0)
+
+    def exchange(self, token: str, address: str) -> Grant:
+        """Return what a token opens; raises Refusal for a wrong one, and for an address that sent too many.
+
+        An address with too many wrong tokens is still granted random ones, which cannot be guessed: else whoever
+        shares the operator's address could keep the operator out.
+        """
+        now = time.monotonic()
+        recent = [t for t in self._wrong.get(address, []) if now - t < WRONG_TOKENS_SECONDS]
+        limited = len(recent) >= WRONG_TOKENS
+        if (expiry := self._one_time.pop(token, None)) is not None and now < expiry:
+            return self.grants["operate"]
+        matching = [grant for grant in self.grants.values() if _is_equal(token, grant.token)]
+        if matching and not (limited and matching[0].chosen):
+            return matching[0]
+        if limited:
+            raise Refusal(
+                HTTPStatus.TOO_MANY_REQUESTS,
+                f"Too many wrong links came from this address: wait {WRONG_TOKENS_SECONDS:.0f} s, then try again.",
+            )
+        if address not in self._wrong and len(self._wrong) >= _MOST_ADDRESSES:
+            self._wrong.pop(next(iter(self._wrong)))
+        self._wrong[address] = [*recent, now]
+        raise Refusal(HTTPStatus.FORBIDDEN, "This link is not, or no longer, valid: open the one last printed.")
+
+    def authorise(self, path: str, headers: Headers) -> tuple[Grant, str]:
+        """Return the grant that a path and the request's cookie belong to, and the rest of the path, without a slash.
+
+        Raises Refusal without a valid cookie.
+        """
+        match = _PATH.fullmatch(path)
+        for grant in self.grants.values():
+            if match and _is_equal(match[1], grant.path) and grant.accepts(headers):
+                return grant, (match[2] or "/")[1:]
         raise Refusal(
             HTTPStatus.FORBIDDEN,
             "This page belongs to whoever started slviewer: open the link that it printed where it was started.",
         )
 
-    def set_cookie(self, role: Role) -> str:
-        """Return the Set-Cookie header of a role: HttpOnly, SameSite, for this browser session."""
-        token = self.token if role == "operator" else self.view_token
-        return f"{self.cookie_name}={token}; HttpOnly; SameSite=Strict; Path=/"
+    def is_encrypted(self, headers: Headers) -> bool:
+        """Whether the browser's side of the connection is encrypted, by this server or by a proxy that says so."""
+        return self.tls or [value.lower() for value in headers.get_all("X-Forwarded-Proto")] == ["https"]
 
     def host(self, headers: Headers, local_address: str) -> str:
         """The request's Host if it is one of this server's names; raises Refusal otherwise (DNS rebinding)."""
         hosts = headers.get_all("Host")
         if len(hosts) != 1 or hosts[0].lower() not in self._list_hosts(local_address):
-            raise Refusal(HTTPStatus.MISDIRECTED_REQUEST, "This server is not reached by that host name.")
+            raise Refusal(
+                HTTPStatus.MISDIRECTED_REQUEST,
+                "This server is not reached by that host name: start slviewer with --name and this name, if it is one.",
+            )
         return hosts[0].lower()
 
     def check_origin(self, headers: Headers, host: str, websocket: bool) -> None:
@@ -111,13 +225,10 @@ class Access:
             machine = socket.gethostname().lower()
             bare |= {machine, f"{machine}.local"}
         bare |= self.names
-        return {f"{name}:{self.port}" for name in bare} | self.names | (bare if self.port == 80 else set())
+        standard = self.port == (443 if self.tls else 80)
+        return {f"{name}:{self.port}" for name in bare} | self.names | (bare if standard else set())
 
 
-def _check_token(token: str | None) -> str:
-    """The token, checked for its characters and length; a random one for None. Raises UsageError."""
-    if token is None:
-        return secrets.token_urlsafe(24)
-    if not _TOKEN.fullmatch(token):
-        raise UsageError("A token has 16 or more letters, digits, - and _: leave it out and slviewer makes one.")
-    return token
+def _is_equal(given: str, expected: str) -> bool:
+    """Whether two texts are equal, compared in constant time."""
+    return hmac.compare_digest(given.encode("utf-8", "surrogateescape"), expected.encode())

@@ -1,119 +1,166 @@
 """Authentication and routing of every HTTP request."""
 
+import json
 import logging
 import re
 from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
 from http import HTTPStatus
-from typing import NamedTuple
-from urllib.parse import parse_qsl
+from importlib import resources
 
 from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 
-from slviewer.server.access import Access, Refusal
+from slviewer.server.access import Access, Grant, Refusal
 from slviewer.server.connection import Connection
 from slviewer.server.downloads import PREFIX, Downloads
+from slviewer.server.limits import Admissions, address_group
 from slviewer.server.responses import harden, page_policy, respond, viser_policy
 
 logger = logging.getLogger("slviewer.server")
 
-_PATH = re.compile(r"/|(/[A-Za-z0-9_-][A-Za-z0-9._-]*)+")
+LOGIN = "/login"
+PROJECTOR = "projector"
+"""Below the operator's path: leads to the projector page with the rights of that page alone."""
+_HTML = "text/html; charset=utf-8"
+_PATH = re.compile(r"/|(/[A-Za-z0-9_-][A-Za-z0-9._-]*)+/?")
 
-_REDIRECT = """<!doctype html><meta charset="utf-8"><title>slviewer</title><script>location.replace(location.pathname)\
-</script><noscript><a href="{path}">Open slviewer</a></noscript>"""
 
+@dataclass
+class ProjectorPage:
+    """The projector page, where one is served, and the handler of the WebSockets that it opens."""
 
-class Route(NamedTuple):
-    """A page besides viser's, for the operator alone, and the handler of the WebSockets that it opens."""
-
-    html: bytes
-    handler: Callable[[ServerConnection], Awaitable[None]]
+    html: bytes = b""
+    handler: Callable[[ServerConnection], Awaitable[None]] | None = None
 
 
 class AuthMiddleware:
     """Authorises and answers a server's requests: viser's page, our own pages and files, and WebSockets."""
 
     def __init__(
-        self, access: Access, routes: dict[str, Route], downloads: Downloads, page: bytes, scripts: tuple[str, ...]
+        self,
+        access: Access,
+        admissions: Admissions,
+        projector: ProjectorPage,
+        downloads: Downloads,
+        page: bytes,
+        scripts: tuple[str, ...],
+        subprotocol: str,
+        strict_transport: bool = False,
     ) -> None:
-        """`routes` by path; `page` is viser's, and `scripts` the hashes of those that it may run."""
+        """`page` is viser's, `scripts` the hashes of those that it may run, `subprotocol` that of its WebSocket.
+
+        `strict_transport`: browsers are told to use this host encrypted from now on.
+        """
         self._access = access
-        self._routes = routes
+        self._admissions = admissions
+        self._projector = projector
         self._downloads = downloads
         self._viser_page = page
         self._scripts = scripts
+        self._subprotocol = subprotocol
+        self._strict_transport = strict_transport
+        self._login_page = resources.files("slviewer.server").joinpath("login.html").read_bytes()
 
     async def answer(self, connection: Connection, request: Request) -> Response | None:
         """Return the response to a request, hardened; None to open a WebSocket."""
+        host = ""
         try:
-            return await self._answer(connection, request)
+            host = self._access.host(request.headers, connection.transport.get_extra_info("sockname")[0])
+            response = await self._answer(connection, request, host)
         except Refusal as refusal:
-            response = respond(refusal.status, refusal.sentence + "\n")
+            response = self._refuse(refusal, request, host)
         except Exception:
             logger.exception("a request failed")
             response = respond(HTTPStatus.INTERNAL_SERVER_ERROR, "slviewer failed: see its log.\n")
+            harden(response.headers)
+        if response is not None and self._strict_transport:
+            response.headers["Strict-Transport-Security"] = "max-age=86400"
+        return response
+
+    async def _answer(self, connection: Connection, request: Request, host: str) -> Response | None:
+        """Return the response to an authorised request, None to open a WebSocket; raises Refusal otherwise."""
+        headers, access = request.headers, self._access
+        websocket = any(value.lower() == "websocket" for value in headers.get_all("Upgrade"))
+        access.check_origin(headers, host, websocket)
+        path, _, _ = request.path.partition("?")
+        if not _PATH.fullmatch(path):
+            raise Refusal(HTTPStatus.NOT_FOUND, "There is nothing here.")
+        if "?" in request.path:  # some parameters make viser's page load messages, and so code, from elsewhere
+            raise Refusal(HTTPStatus.BAD_REQUEST, "This address takes no parameters.")
+        if not websocket and path == "/":
+            return self._page(self._login_page, page_policy(self._login_page, host))
+        if not websocket and path == "/favicon.ico":  # browsers ask by themselves, and would report that there is none
+            return self._empty()
+        if not websocket and path == LOGIN:
+            return self._log_in(connection, request)
+        grant, rest = access.authorise(path, headers)
+        self._admissions.admit(connection, grant.role)
+        if websocket:
+            self._check_websocket(request, grant, rest)
+            return None
+        if rest == "favicon.ico":  # asked for by the page of "/" too, which so learns whether its cookie is valid
+            return self._empty()
+        if grant.role == "project":
+            if rest or self._projector.handler is None:
+                raise Refusal(HTTPStatus.NOT_FOUND, "There is no projector page here.")
+            return self._page(self._projector.html, page_policy(self._projector.html, host))
+        if not rest:
+            return self._page(self._viser_page, viser_policy(self._scripts, host))
+        if rest.startswith(PREFIX):
+            return await self._download(connection, rest)
+        if rest == PROJECTOR and grant.role == "operate" and self._projector.handler is not None:
+            return self._lead_to(access.grants["project"], request)
+        raise Refusal(HTTPStatus.NOT_FOUND, "There is nothing here for this link.")
+
+    def _check_websocket(self, request: Request, grant: Grant, rest: str) -> None:
+        """Raise Refusal unless the role has a WebSocket at the rest of this path."""
+        if rest or (grant.role == "project" and self._projector.handler is None):
+            raise Refusal(HTTPStatus.NOT_FOUND, "There is nothing here.")
+        if grant.role != "project" and request.headers.get_all("Sec-WebSocket-Protocol") != [self._subprotocol]:
+            raise Refusal(HTTPStatus.BAD_REQUEST, "This page is of another version: reload it.")
+
+    def _log_in(self, connection: Connection, request: Request) -> Response:
+        """Respond to the token in the Authorization header with the cookie and the path that it opens, as JSON."""
+        scheme, _, token = " ".join(request.headers.get_all("Authorization")).partition(" ")
+        if scheme.lower() != "bearer":
+            raise Refusal(HTTPStatus.UNAUTHORIZED, "There is no token: open the link that slviewer printed.")
+        peer = connection.transport.get_extra_info("peername")
+        grant = self._access.exchange(token.strip(), address_group(peer[0]))
+        response = respond(HTTPStatus.OK, json.dumps({"path": f"{grant.path}/"}), "application/json")
+        response.headers["Set-Cookie"] = grant.set_cookie(self._access.is_encrypted(request.headers))
         harden(response.headers)
         return response
 
-    async def _answer(self, connection: Connection, request: Request) -> Response | None:
-        """Return the response to an authorised request, None to open a WebSocket; raises Refusal otherwise."""
-        headers, access = request.headers, self._access
-        host = access.host(headers, connection.transport.get_extra_info("sockname")[0])
-        websocket = any(value.lower() == "websocket" for value in headers.get_all("Upgrade"))
-        access.check_origin(headers, host, websocket)
-        path, _, query = request.path.partition("?")
-        if not _PATH.fullmatch(path):  # "//elsewhere" in a redirect would lead to another site
-            raise Refusal(HTTPStatus.NOT_FOUND, "There is nothing here.")
-        if "?" in request.path:
-            if websocket:
-                raise Refusal(HTTPStatus.BAD_REQUEST, "This address takes no parameters.")
-            return self._accept_token(path, query, host, "cross-site" in headers.get_all("Sec-Fetch-Site"))
-        role = access.role(headers)
-        if path in self._routes and role != "operator":
-            raise Refusal(HTTPStatus.FORBIDDEN, "This link is view-only: the page is for the operator.")
-        if websocket:
-            if path != "/" and path not in self._routes:
-                raise Refusal(HTTPStatus.NOT_FOUND, "There is nothing here.")
-            connection.role = role
-            return None
-        if path == "/":
-            response = respond(HTTPStatus.OK, self._viser_page, "text/html; charset=utf-8")
-            harden(response.headers, viser_policy(self._scripts, host))
-            return response
-        if path == "/favicon.ico":  # browsers ask by themselves, and would report that there is none
-            response = respond(HTTPStatus.NO_CONTENT)
-            harden(response.headers)
-            return response
-        if path.startswith(PREFIX):
-            return await self._download(connection, path)
-        if path not in self._routes:
-            raise Refusal(HTTPStatus.NOT_FOUND, "There is nothing here.")
-        html = self._routes[path].html
-        response = respond(HTTPStatus.OK, html, "text/html; charset=utf-8")
-        harden(response.headers, page_policy(html, host))
+    def _lead_to(self, grant: Grant, request: Request) -> Response:
+        """Redirect the operator's browser to the page of another role, with its cookie."""
+        response = respond(HTTPStatus.SEE_OTHER)
+        response.headers["Location"] = f"{grant.path}/"
+        response.headers["Set-Cookie"] = grant.set_cookie(self._access.is_encrypted(request.headers))
+        harden(response.headers)
         return response
 
-    def _accept_token(self, path: str, query: str, host: str, from_another_site: bool) -> Response:
-        """Respond to the link with the token: set a cookie, and redirect to the same address without the token.
+    def _refuse(self, refusal: Refusal, request: Request, host: str) -> Response:
+        """Respond with the reason of a refusal; where a person reads it, on the page that takes a link."""
+        person = any("text/html" in value for value in request.headers.get_all("Accept"))
+        if host and person and refusal.status == HTTPStatus.FORBIDDEN:
+            return self._page(self._login_page, page_policy(self._login_page, host), HTTPStatus.FORBIDDEN)
+        response = respond(refusal.status, refusal.sentence + "\n")
+        harden(response.headers)
+        return response
 
-        Any other parameter is refused: some make viser's page load messages, and so code, from elsewhere.
-        """
-        fields = parse_qsl(query, keep_blank_values=True)
-        if len(fields) != 1 or fields[0][0] != "token":
-            raise Refusal(HTTPStatus.BAD_REQUEST, "This address takes no parameters.")
-        role = self._access.role_of(fields[0][1])
-        if role is None:
-            raise Refusal(HTTPStatus.FORBIDDEN, "This link is not, or no longer, valid: open the one last printed.")
-        if from_another_site:
-            # A browser that was sent here by another site's link would send on no strict cookie: our own page must.
-            html = _REDIRECT.format(path=path).encode()
-            response = respond(HTTPStatus.OK, html, "text/html; charset=utf-8")
-            harden(response.headers, page_policy(html, host))
-        else:
-            response = respond(HTTPStatus.SEE_OTHER)
-            response.headers["Location"] = path
-            harden(response.headers)
-        response.headers["Set-Cookie"] = self._access.set_cookie(role)
+    @staticmethod
+    def _page(html: bytes, policy: str, status: HTTPStatus = HTTPStatus.OK) -> Response:
+        """Respond with a page under this Content-Security-Policy."""
+        response = respond(status, html, _HTML)
+        harden(response.headers, policy)
+        return response
+
+    @staticmethod
+    def _empty() -> Response:
+        """Respond without content."""
+        response = respond(HTTPStatus.NO_CONTENT)
+        harden(response.headers)
         return response
 
     async def _download(self, connection: Connection, path: str) -> Response:

@@ -6,20 +6,21 @@ import socket
 import threading
 
 from slviewer.errors import SlviewerError
+from slviewer.server.limits import Listener
 
 RESOLVE_SECONDS = 1.5
 """A name server that does not answer must not keep the operator waiting."""
 
 
-def listen(host: str, port: int) -> socket.socket:
-    """A TCP socket listening at exactly this address; port 0 takes any free one.
+def listen(host: str, port: int) -> Listener:
+    """A TCP socket listening at exactly this address, with limits for strangers; port 0 takes any free one.
 
     Raises SlviewerError within two seconds where the port is in use or the address is not this machine's.
     """
     if not host or not 0 <= port <= 65535:
         raise SlviewerError(f"{host or 'An empty host'}:{port} is no address to serve at: try 127.0.0.1 and port 8080.")
     family, address = _resolve(host, port)
-    sock = socket.socket(family, socket.SOCK_STREAM)
+    sock = Listener(family, socket.SOCK_STREAM)
     try:
         if os.name == "posix":  # elsewhere this option lets two programs share a port
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)

@@ -13,6 +13,8 @@ from websockets.http11 import Response
 from slviewer.server.access import Role
 
 REQUEST_SECONDS = 10
+REQUEST_BYTES = 32_768
+"""Of a request with all its headers; browsers send a tenth of it."""
 STALL_SECONDS = 30
 CHUNK = 2**17
 """Bytes; after the last chunk is written, a slow reader has ten seconds for it."""
@@ -26,6 +28,16 @@ class Connection(ServerConnection):
     role: Role | None = None
     gate: Gate | None = None
     """What a message becomes on its way in; None drops it."""
+    _request_bytes = 0
+
+    def data_received(self, data: bytes) -> None:
+        """As websockets, but a request that is too long ends the connection before it takes up memory."""
+        if self.request is None:
+            self._request_bytes += len(data)
+            if self._request_bytes > REQUEST_BYTES:
+                self.transport.abort()
+                return
+        super().data_received(data)
 
     async def handshake(self, *args: Any, **kwargs: Any) -> None:
         """As websockets, whose own limit would cut a long download too: here it covers the request alone."""
@@ -82,7 +94,8 @@ class _Tail(Response):
 def quiet_logger() -> logging.Logger:
     """The websockets logger of this server, which drops errors that clients cause, such as failed handshakes."""
     logger = logging.getLogger("slviewer.server.websockets")
-    if not logger.filters:
+    logger.setLevel(logging.WARNING)  # else every connection is logged
+    if _is_server_error not in logger.filters:
         logger.addFilter(_is_server_error)
     return logger
 

@@ -14,7 +14,8 @@ from websockets.datastructures import Headers
 from slviewer.errors import InputError
 from slviewer.server.text import safe_name
 
-PREFIX = "/download/"
+PREFIX = "download/"
+"""Of addresses, which are relative to the page: the path of the role that may fetch the file stands before it."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +34,7 @@ class Downloads:
         self._offers: dict[str, Offer] = {}
 
     def offer(self, path: Path, *, within: Path, name: str | None = None) -> str:
-        """The address, on this server, at which this file is fetched until `clear`.
+        """The address, relative to the wizard's page, at which this file is fetched until `clear`.
 
         `within` is the folder that it belongs to (the session's); InputError where the file is missing or, through
         links or "..", is elsewhere. It is read when it is fetched, so that the newest content arrives.

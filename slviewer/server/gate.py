@@ -17,6 +17,13 @@ logger = logging.getLogger("slviewer.server")
 
 VIEWER_LIMIT = 4096
 """Bytes of a message from someone who only watches: more than the longest that says where they look from."""
+MESSAGES: dict[Role, frozenset[type]] = {
+    "operate": frozenset(inside.FROM_CLIENTS.values()),
+    # viewpoint, and confirmation that something was drawn where that is requested
+    "watch": frozenset({messages.ViewerCameraMessage, messages.LocalStorageGetItemResponseMessage}),
+    "project": frozenset(),
+}
+"""The messages of viser that each role may send; all others, and those of later versions, are refused."""
 TEXT_LIMIT = 20_000
 """Characters; no input of the wizard needs a tenth of it."""
 
@@ -38,7 +45,7 @@ class ViserGate:
         """Return the bytes of a client's message to pass on to viser; None where it is refused and dropped."""
         if self._client is None:
             self._client = inside.client_of(self._server, self._connection)
-        usable = isinstance(raw, bytes) and (self._role == "operator" or len(raw) < VIEWER_LIMIT)
+        usable = isinstance(raw, bytes) and (self._role == "operate" or len(raw) < VIEWER_LIMIT)
         message = inside.decode(raw) if usable else None
         if message is None or self._client is None:
             logger.debug("client %s: dropped a message that is none", self._client)
@@ -60,10 +67,8 @@ class ViserGate:
         """Return the bytes to pass on to viser for this message; raises MessageRefused if it is not allowed."""
         server, client = self._server, self._client
         assert client is not None
-        # viewers may send their viewpoint, and confirm that something was drawn where that is requested
-        watching = messages.ViewerCameraMessage | messages.LocalStorageGetItemResponseMessage
-        if self._role != "operator" and not isinstance(message, watching):
-            raise MessageRefused("this link only watches", correct=True)
+        if type(message) not in MESSAGES[self._role]:
+            raise MessageRefused("not for this link", correct=True)
         if not _is_finite(vars(message)):
             raise MessageRefused("numbers that are none")
         match message:
@@ -126,7 +131,7 @@ class ViserGate:
             inside.notify(self._server, self._client, "Not uploaded", f"The file was refused: {refused}.")
         elif isinstance(message, messages.GuiUpdateMessage) and refused.correct:
             handle = inside.gui_input(self._server, self._client, message.uuid)
-            if handle is not None:
+            if handle is not None and not (inside.is_private(handle) and self._role != "operate"):
                 inside.send_value(self._server, self._client, handle)
 
     def _forget_upload(self, transfer: str) -> None:

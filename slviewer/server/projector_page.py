@@ -9,17 +9,15 @@ from websockets.exceptions import ConnectionClosed
 
 from slviewer.devices.channel import Channel
 from slviewer.errors import InputError
-from slviewer.server.auth_middleware import Route
 from slviewer.server.secure import SafeServer
 
-PATH = "/projector"
 ANOTHER_WINDOW, NOT_UNDERSTOOD = 4001, 1008
 """Why the connection was closed: the page then waits for somebody to ask for it, or connects again."""
 _HELLO_S = 5.0
 
 
 def serve_projector(server: SafeServer, channel: Channel) -> None:
-    """Serve the page at `server.link(PATH)`, to the operator alone, and connect it to `channel`."""
+    """Serve the page at `server.link("project")`, and connect it to `channel`."""
     html = resources.files("slviewer.server").joinpath("projector.html").read_text("utf-8")
 
     async def handle(connection: ServerConnection) -> None:
@@ -27,7 +25,7 @@ def serve_projector(server: SafeServer, channel: Channel) -> None:
         with contextlib.suppress(ConnectionClosed):
             await _talk(connection, channel)
 
-    server.routes[PATH] = Route(html.encode(), handle)
+    server.projector.html, server.projector.handler = html.encode(), handle
 
 
 async def _talk(connection: ServerConnection, channel: Channel) -> None:

@@ -1,9 +1,9 @@
 """A viser server that only invited browsers reach, and that changes only what its page offers them to change."""
 
 import ipaddress
-import urllib.parse
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import viser
@@ -12,53 +12,99 @@ from websockets.asyncio.server import serve as serve_websockets
 
 from slviewer.server import viser_internals
 from slviewer.server.access import Access, Role
-from slviewer.server.auth_middleware import AuthMiddleware, Route
+from slviewer.server.auth_middleware import AuthMiddleware, ProjectorPage
 from slviewer.server.binding import listen
-from slviewer.server.connection import Connection, quiet_logger
+from slviewer.server.connection import REQUEST_SECONDS, Connection, quiet_logger
+from slviewer.server.credentials import Certificate, load_tokens, save_tokens, self_made_certificate
 from slviewer.server.downloads import Downloads
 from slviewer.server.gate import ViserGate
+from slviewer.server.limits import Admissions, limit_log, raise_descriptor_limit
 from slviewer.server.responses import script_hash
 from slviewer.server.uploads import UploadBudget
 
 MESSAGE_LIMIT = 32 * 2**20
 """Bytes of one message from a browser; the largest is a picture that the server requested."""
+_LEAVING_SECONDS = 3.0
+"""How long a browser that requested new links may take to open its own."""
+
+
+@dataclass(frozen=True)
+class Serving:
+    """Where and how to serve. `port` 0 takes any free one.
+
+    `names` are further host names (`name` or `name:port`) under which browsers reach the server, behind a proxy, say.
+    `tls`: encrypt, with the files of a certificate (PEM: the chain, the key), else with a self-made one. `token_file`
+    holds tokens that stay the same.
+    """
+
+    host: str = "127.0.0.1"
+    port: int = 8080
+    names: tuple[str, ...] = ()
+    tls: bool = False
+    tls_files: tuple[Path, Path] | None = None
+    token_file: Path | None = None
 
 
 @dataclass(frozen=True)
 class SafeServer:
-    """A running server: build the page with `viser`, add pages by path to `routes`, offer files with `downloads`."""
+    """A running server: build the page with `viser`, offer files with `downloads`, set the page of `projector`."""
 
     viser: viser.ViserServer
-    routes: dict[str, Route]
+    projector: ProjectorPage
     downloads: Downloads
-    host: str
-    port: int
+    serving: Serving
     access: Access
+    admissions: Admissions
+    certificate: Certificate | None
 
     @property
-    def url(self) -> str:
-        """The operator's link, with the token."""
-        return self.link("/")
+    def port(self) -> int:
+        """The port that it listens at."""
+        return self.access.port
 
     @property
-    def view_url(self) -> str:
-        """The link for viewers, who may change nothing."""
-        return self.link("/", "viewer")
+    def origin(self) -> str:
+        """Scheme, host and port of its address."""
+        return f"{'https' if self.certificate else 'http'}://{self._format_host()}:{self.port}"
 
-    def link(self, path: str, role: Role = "operator") -> str:
-        """The address of a page of this server with a token, to be opened once; as secret as a password."""
-        token = self.access.token if role == "operator" else self.access.view_token
-        return f"http://{self._format_host()}:{self.port}{path}?{urllib.parse.urlencode({'token': token})}"
+    def link(self, role: Role = "operate", origin: str | None = None) -> str:
+        """The link of a role, with its token behind the #, which browsers do not send; as secret as a password.
+
+        `origin` (scheme, host, port) is the address to use where that is another one than the server's own.
+        """
+        return f"{origin or self.origin}/#{self.access.grants[role].token}"
+
+    def one_time_link(self) -> str:
+        """A link for the operator's browser that can be opened once, soon."""
+        return f"{self.origin}/#{self.access.issue_one_time_token()}"
+
+    def renew_links(self, client_id: int) -> None:
+        """Replace all tokens, close all connections, and lead the operator's client that requested it to its new page.
+
+        Raises OSError where the tokens come from a file that cannot be replaced; they are replaced here nevertheless.
+        """
+        leaving = viser_internals.connection_of(self.viser, client_id)
+        self.access.renew()
+        viser_internals.call_soon(self.viser, 0.0, self.admissions.close_all, leaving)
+        viser_internals.navigate(self.viser, client_id, f"/#{self.access.issue_one_time_token()}")
+        viser_internals.call_soon(self.viser, _LEAVING_SECONDS, self.admissions.close_all, None, leaving)
+        if self.serving.token_file is not None:
+            save_tokens(self.serving.token_file, {role: grant.token for role, grant in self.access.grants.items()})
 
     @property
     def loopback(self) -> bool:
-        """Whether only this machine can reach it. If not, tokens cross the network unencrypted."""
+        """Whether only this machine can reach it."""
         return ipaddress.ip_address(self._address()).is_loopback
 
     def role(self, client_id: int) -> Role | None:
-        """The role of a client of viser, operator or viewer; None once it is disconnected."""
+        """The role of a client of viser, "operate" or "watch"; None once it is disconnected."""
         connection = viser_internals.connection_of(self.viser, client_id)
         return None if connection is None else connection.role
+
+    def origin_of(self, client_id: int) -> str | None:
+        """The origin (scheme, host, port) of a client's page, which a proxy may serve; None once disconnected."""
+        connection = viser_internals.connection_of(self.viser, client_id)
+        return None if connection is None else connection.request.headers["Origin"]
 
     def stop(self) -> None:
         """End all connections, the server and its threads."""
@@ -76,32 +122,39 @@ class SafeServer:
         return f"[{address}]" if address.version == 6 else str(address)
 
 
-def serve(
-    host: str = "127.0.0.1",
-    port: int = 8080,
-    *,
-    token: str | None = None,
-    view_token: str | None = None,
-    label: str | None = None,
-    names: tuple[str, ...] = (),
-    upload_limit: int = 256 * 10**6,
-) -> SafeServer:
-    """Start the server of viser's page; port 0 takes any free one.
+def serve(serving: Serving, *, label: str | None = None, upload_limit: int = 256 * 10**6) -> SafeServer:
+    """Start the server of viser's page. `upload_limit` bounds the bytes of all unfinished uploads.
 
-    `names` are further host names (`name` or `name:port`) under which browsers reach this server. `upload_limit` bounds
-    the bytes of all unfinished uploads.
-
-    Raises SlviewerError within two seconds where the address can't be served, and where viser is not the pinned one.
+    Raises SlviewerError within two seconds where the address can't be served, where viser is not the pinned one, and
+    where tokens or certificate cannot be used.
     """
     viser_internals.check_version()
-    sock = listen(host, port)
+    tokens = {} if serving.token_file is None else load_tokens(serving.token_file)
+    certificate = None
+    if serving.tls_files is not None:
+        certificate = Certificate(*serving.tls_files)
+    elif serving.tls:
+        certificate = self_made_certificate(serving.host, serving.names)
+    context = certificate.context() if certificate else None
+    limit_log()
+    raise_descriptor_limit()
+    sock = listen(serving.host, serving.port)
     address, port = sock.getsockname()[:2]
     try:
-        access = Access(port, token, view_token, names)
-        routes: dict[str, Route] = {}
-        downloads = Downloads()
-        scripts = (*viser_internals.VISER_SCRIPTS, script_hash(viser_internals.ONE_DRAW))
-        middleware = AuthMiddleware(access, routes, downloads, viser_internals.client_page(), scripts)
+        access = Access(port, tokens, serving.names, tls=certificate is not None)
+        admissions = Admissions(sock)
+        projector, downloads = ProjectorPage(), Downloads()
+        scripts = (*viser_internals.VISER_SCRIPTS, script_hash(viser_internals.PAGE_SCRIPT))
+        middleware = AuthMiddleware(
+            access,
+            admissions,
+            projector,
+            downloads,
+            viser_internals.client_page(),
+            scripts,
+            viser_internals.SUBPROTOCOL,
+            strict_transport=certificate is not None and not certificate.self_made,
+        )
         budget = UploadBudget(upload_limit)
         started: list[viser.ViserServer] = []
 
@@ -109,12 +162,11 @@ def serve(
             """Start viser's WebSocket server behind the middleware, in place of its own."""
 
             async def handle(connection: ServerConnection) -> None:
-                """Handle a WebSocket: by the route of its path, else by viser behind a gate."""
+                """Handle a WebSocket: of the projector page, else by viser behind a gate."""
                 assert isinstance(connection, Connection)
-                path = connection.request.path if connection.request else "/"
-                if path in routes:
-                    await routes[path].handler(connection)
-                elif path == "/" and started and connection.role is not None:
+                if connection.role == "project" and projector.handler is not None:
+                    await projector.handler(connection)
+                elif connection.role in ("operate", "watch") and started:
                     gate = connection.gate = ViserGate(started[0], connection, connection.role, budget)
                     try:
                         await viser_handler(connection)
@@ -130,6 +182,8 @@ def serve(
                 open_timeout=None,  # Connection limits the request alone
                 logger=quiet_logger(),
             )
+            if context is not None:
+                options.update(ssl=context, ssl_handshake_timeout=REQUEST_SECONDS)
             return serve_websockets(handle, **options)
 
         server = viser_internals.start(serve_viser, address, port, label)
@@ -137,4 +191,4 @@ def serve(
     except BaseException:
         sock.close()
         raise
-    return SafeServer(server, routes, downloads, host, port, access)
+    return SafeServer(server, projector, downloads, replace(serving, port=port), access, admissions, certificate)

@@ -6,6 +6,7 @@ in. A test compares what is used here with what it was when this was written.
 
 import contextlib
 import dataclasses
+import json
 import secrets
 import threading
 from collections.abc import Callable, Iterator
@@ -25,6 +26,8 @@ from viser.infra import _infra
 from slviewer.errors import SlviewerError
 
 VISER = "1.1.1"
+SUBPROTOCOL = f"viser-v{VISER}"
+"""With which viser's page opens its WebSocket."""
 
 VISER_SCRIPTS = (
     "'sha256-5iRcjB7VnwnYpbUpHa15FmjNIRu22hIQnvWuocHMxJw='",
@@ -35,7 +38,7 @@ VISER_SCRIPTS = (
 Message = _messages.Message
 
 CLIENT_PAGE = Path(viser.__file__).parent / "client" / "build" / "index.html"
-ONE_DRAW = resources.files("slviewer.server").joinpath("one_draw.js").read_bytes()
+PAGE_SCRIPT = resources.files("slviewer.server").joinpath("page_script.js").read_bytes()
 """Our script, which runs in viser's page before its own."""
 
 FROM_CLIENTS: dict[str, type[Any]] = {
@@ -102,7 +105,7 @@ def check_version() -> None:
 def client_page() -> bytes:
     """The page that viser serves, with our script in it."""
     before, loader, after = CLIENT_PAGE.read_bytes().partition(b"<script data-p=")
-    return b"".join([before, b"<script>", ONE_DRAW, b"</script>", loader, after])
+    return b"".join([before, b"<script>", PAGE_SCRIPT, b"</script>", loader, after])
 
 
 def stop(server: viser.ViserServer) -> None:
@@ -155,6 +158,36 @@ def client_of(server: viser.ViserServer, connection: object) -> int | None:
 def connection_of(server: viser.ViserServer, client_id: int) -> Any:
     """The connection of the client with this number, or None."""
     return server._websock_server._live_connections.get(client_id)
+
+
+def call_soon(server: viser.ViserServer, delay_s: float, function: Callable[..., Any], *args: Any) -> None:
+    """Call a function on the server's own thread, after a delay."""
+    loop = server._websock_server._background_event_loop
+    assert loop is not None
+    with contextlib.suppress(RuntimeError):  # the server has stopped
+        loop.call_soon_threadsafe(lambda: loop.call_later(delay_s, function, *args))
+
+
+def navigate(server: viser.ViserServer, client_id: int, address: str) -> None:
+    """Let one client's page give way to another address of this server."""
+    _queue_message(server, client_id, _messages.RunJavascriptMessage(f"location.replace({json.dumps(address)})"))
+
+
+def make_private(handle: Any) -> None:
+    """Send what is typed into this input to no other browser; `send_private_values` sends it to operators."""
+    handle._impl.sync_cb = None
+
+
+def is_private(handle: Any) -> bool:
+    """Whether `make_private` was called for this input."""
+    return handle._impl.sync_cb is None and not handle._impl.is_button
+
+
+def send_private_values(server: viser.ViserServer, client_id: int) -> None:
+    """Show one client the values of all private inputs."""
+    for handle in list(server.gui._gui_input_handle_from_uuid.values()):
+        if is_private(handle):
+            send_value(server, client_id, handle)
 
 
 def gui_apis(server: viser.ViserServer, client_id: int | None) -> list[viser.GuiApi]:

@@ -24,7 +24,7 @@ from slviewer.errors import SlviewerError
 from slviewer.gui.app import App
 from slviewer.pipeline.feedback import Progress, ignore_progress
 from slviewer.pipeline.models import save_imported_stereo
-from slviewer.server.secure import SafeServer
+from slviewer.server.secure import SafeServer, Serving
 from slviewer.session.store import Session
 from slviewer.simulation.rig import letter
 from slviewer.simulation.truth import rig_record
@@ -185,12 +185,12 @@ class _Viewer:
 
     def _connect(self) -> ClientConnection:
         """Open a WebSocket to the server with the view token, as viser's page does."""
-        port, access = self._server.port, self._server.access
+        port, grant = self._server.port, self._server.access.grants["watch"]
         host = f"127.0.0.1:{port}"
         return connect(
-            f"ws://{host}/",
+            f"ws://{host}{grant.path}/",
             sock=socket.create_connection(("127.0.0.1", port), timeout=5),
-            additional_headers=[("Cookie", f"{access.cookie_name}={access.view_token}"), ("Origin", f"http://{host}")],
+            additional_headers=[("Cookie", f"{grant.cookie_name}={grant.value}"), ("Origin", f"http://{host}")],
             subprotocols=[f"viser-v{viser.__version__}"],  # type: ignore[list-item]
             max_size=2**26,
             ping_interval=None,  # who stalls does not give up by itself
@@ -200,7 +200,7 @@ class _Viewer:
 @contextlib.contextmanager
 def _serve_wizard(operator: Operator) -> Iterator[SafeServer]:
     """Serve the wizard for an operator at its scan step; yields the server."""
-    app = App(operator, port=0)
+    app = App(operator, Serving(port=0))
     try:
         app.shell.go("scan")
         yield app.server

@@ -9,6 +9,7 @@ from wizard_page import SIZE, Opened, button
 
 from slviewer.calibration.guidance import pose_selection
 from slviewer.gui.app import App
+from slviewer.server.secure import Serving
 from slviewer.wizard import acquisition
 from slviewer.wizard.operator import Operator
 
@@ -35,7 +36,7 @@ def operator(tmp_path: Path) -> Iterator[Operator]:
 
 @pytest.fixture
 def app(operator: Operator) -> Iterator[App]:
-    wizard = App(operator, port=0)
+    wizard = App(operator, Serving(port=0))
     yield wizard
     wizard.close()
 
@@ -46,7 +47,7 @@ def opened(browser: Browser, app: App) -> Iterator[Opened]:
     page = browser.new_page(viewport=SIZE)
     page.set_default_timeout(20_000)
     found = Opened(page)
-    page.goto(app.server.url)
+    page.goto(app.server.link())
     button(page, "1. Rig").wait_for()
     yield found
     page.close()

@@ -11,6 +11,7 @@ from wizard_page import SIZE, Opened, button
 from slviewer.fringe.layout import to_eight_bits
 from slviewer.gui.app import App
 from slviewer.gui.scene import thin
+from slviewer.server.secure import Serving
 from slviewer.validation import bench_live as rate
 from slviewer.validation.bench_live import true_calibration
 from slviewer.wizard.operator import Operator
@@ -30,7 +31,7 @@ def app(tmp_path: Path) -> Iterator[App]:
     with Operator(folder, slow) as operator:
         assert operator.wait_for(lambda s: s.rig.state == "open", 20.0) is not None
         operator.place("object")
-        wizard = App(operator, port=0)
+        wizard = App(operator, Serving(port=0))
         yield wizard
         wizard.close()
 
@@ -38,7 +39,7 @@ def app(tmp_path: Path) -> Iterator[App]:
 def test_live_clouds_are_seen_kept_and_ended(browser: Browser, app: App) -> None:
     page = browser.new_page(viewport=SIZE)
     found = Opened(page)
-    page.goto(app.server.url)
+    page.goto(app.server.link())
     button(page, "6. Scan").click()
     button(page, "Live").click()
     expect(page.get_by_text("clouds/s").first).to_be_visible(timeout=COMPILED_MS)

@@ -29,6 +29,7 @@ from slviewer.pipeline.calibration_verdict import save_verdict
 from slviewer.pipeline.measurements import quantities_of
 from slviewer.report.data import SpacingRow, VerificationView
 from slviewer.report.quality import comparison_table
+from slviewer.server.secure import Serving
 from slviewer.session.measurements import Measurement
 from slviewer.session.ply import read_ply
 from slviewer.session.store import Session
@@ -51,11 +52,11 @@ def measured(
     with Session.open(folder, write=True) as store:
         store.trash_result("calibration/splined")
     with Operator(folder) as engine:
-        wizard = App(engine, port=0)
+        wizard = App(engine, Serving(port=0))
         page = browser.new_page(viewport=SIZE)
         page.set_default_timeout(20_000)
         found = Opened(page)
-        page.goto(wizard.server.url)
+        page.goto(wizard.server.link())
         button(page, "1. Rig").wait_for()
         yield page, engine, found.errors
         page.close()

@@ -15,6 +15,7 @@ from slviewer.fringe.decode import decode
 from slviewer.gui.app import App
 from slviewer.pipeline.rig_choice import set_up
 from slviewer.pipeline.rig_presets import save_rig
+from slviewer.server.secure import Serving
 from slviewer.session.store import Session
 from slviewer.wizard.operator import Operator
 from slviewer.wizard.snapshot import Snapshot
@@ -47,17 +48,19 @@ def test_a_network_camera_and_a_browser_capture_what_is_projected(browser: Brows
         network_camera(np.full((SCREEN[1], SCREEN[0], 3), 40, np.uint8)) as camera,
         Operator(tmp_path / "session", set_up=partial(set_up, channel=channel)) as operator,
     ):
-        app = App(operator, port=0, channel=channel)
+        app = App(operator, Serving(port=0), channel=channel)
         page = browser.new_context(viewport=SIZE).new_page()  # type: ignore[arg-type]
         projector = browser.new_context(viewport={"width": SCREEN[0], "height": SCREEN[1]}).new_page()
         opened = Opened(page)
         try:
-            page.goto(app.server.url)
+            page.goto(app.server.link())
             button(page, "1. Rig").click()
             choose(page, "Rig", "Custom …")
             expect(page.get_by_text("Projector page: waiting for the page")).to_be_visible()
-            assert app.server.access.token not in page.content()  # whoever only watches reads this too
-            projector.goto(app.server.link("/projector"))
+            content = page.content()  # whoever only watches reads this too
+            grants = app.server.access.grants.values()
+            assert not [grant for grant in grants if any(one in content for one in (grant.token, grant.value))]
+            projector.goto(app.server.link("project"))
             expect(page.get_by_text("Projector page: ready 320 x 240")).to_be_visible()
             field(page, "Camera ID").fill(camera.url)
             page.wait_for_timeout(500)

@@ -38,7 +38,7 @@ def test_from_the_link_to_a_pose_that_a_reload_keeps(opened: Opened, operator: O
 
 def test_a_guest_sees_the_same_step_and_changes_nothing(opened: Opened, app: App, browser: Browser) -> None:
     guest = browser.new_context(viewport=SIZE).new_page()
-    guest.goto(app.server.view_url)
+    guest.goto(app.server.link("watch"))
     expect(guest.get_by_text("View only")).to_be_visible()
     button(opened.page, "2. Target").click()
     expect(button(guest, "Use this board")).to_be_visible()

@@ -16,6 +16,7 @@ from wizard_page import PATIENCE_MS, SIZE, Opened, button, capture_pose, choose,
 
 from slviewer.gui.app import App
 from slviewer.pipeline.rig_choice import Choice, RigSetup, set_up
+from slviewer.server.secure import Serving
 from slviewer.session.store import Session
 from slviewer.target.board import Board
 from slviewer.wizard import tasks
@@ -75,8 +76,8 @@ def test_from_an_unknown_rig_to_a_merged_cloud(
 ) -> None:
     # the joint adjustment takes long, and the autopilot's flight makes it
     monkeypatch.setattr(tasks, "missing_for_splined", lambda session: "it is made elsewhere")
-    app = App(bare, port=0)
-    opened = visit(browser, app.server.url)
+    app = App(bare, Serving(port=0))
+    opened = visit(browser, app.server.link())
     page = opened.page
     try:
         choose(page, "Rig", "Simulated, quarter size")
@@ -223,7 +224,7 @@ def test_whoever_watches_sees_the_pose_and_changes_nothing(
     opened: Opened, operator: Operator, app: App, browser: Browser
 ) -> None:
     operator.choose_target(TARGET)
-    page, watching = opened.page, visit(browser, app.server.view_url)
+    page, watching = opened.page, visit(browser, app.server.link("watch"))
     guest = watching.page
     button(page, "3. Poses").click()
     capture_pose(page, "pose_01")
@@ -323,8 +324,8 @@ def test_a_fault_ends_one_capture_and_says_so(tmp_path: Path, browser: Browser) 
     with Operator(tmp_path / "session", RIG, set_up=rigs) as operator:
         assert operator.wait_for(lambda s: s.rig.state == "open", PATIENCE_S)
         operator.choose_target(TARGET)
-        app = App(operator, port=0)
-        opened = visit(browser, app.server.url)
+        app = App(operator, Serving(port=0))
+        opened = visit(browser, app.server.link())
         page = opened.page
         try:
             button(page, "3. Poses").click()

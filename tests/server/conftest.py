@@ -5,19 +5,19 @@ from collections.abc import Iterator
 import pytest
 from server_client import Browser
 
-from slviewer.server.secure import SafeServer, serve
+from slviewer.server.secure import SafeServer, Serving, serve
 
 
 @pytest.fixture(scope="module")
 def server() -> Iterator[SafeServer]:
-    server = serve(port=0, upload_limit=3_000_000)
+    server = serve(Serving(port=0), upload_limit=3_000_000)
     yield server
     server.stop()
 
 
 @pytest.fixture
 def operator(server: SafeServer) -> Iterator[Browser]:
-    browser = Browser(server, server.access.token)
+    browser = Browser(server, "operate")
     yield browser
     browser.close()
     server.viser.gui.reset()
@@ -26,9 +26,14 @@ def operator(server: SafeServer) -> Iterator[Browser]:
 
 @pytest.fixture
 def watcher(server: SafeServer) -> Iterator[Browser]:
-    browser = Browser(server, server.access.view_token)
+    browser = Browser(server, "watch")
     yield browser
     browser.close()
+
+
+@pytest.fixture
+def projector_page(server: SafeServer) -> Browser:
+    return Browser(server, "project")
 
 
 @pytest.fixture

@@ -2,6 +2,7 @@
 
 import contextlib
 import http.client
+import json
 import socket
 import threading
 import time
@@ -13,6 +14,7 @@ import viser
 import zstandard
 from websockets.sync.client import ClientConnection, connect
 
+from slviewer.server.access import Role
 from slviewer.server.secure import SafeServer
 
 CAMERA = {
@@ -72,31 +74,46 @@ class Client:
 
 
 class Browser:
-    """Requests to one server, with the cookie that a token gave."""
+    """Requests to one server, with the cookie of a role and below its path."""
 
-    def __init__(self, server: SafeServer, token: str | None) -> None:
+    def __init__(self, server: SafeServer, role: Role | None) -> None:
         self.server = server
         self.host = f"127.0.0.1:{server.port}"
-        self.cookie = f"slviewer_{server.port}={token}" if token else None
+        grant = server.access.grants[role] if role else None
+        self.cookie = f"{grant.cookie_name}={grant.value}" if grant else None
+        self.path = f"{grant.path}/" if grant else "/"
         self.clients: list[Client] = []
 
-    def get(self, path: str, **headers: str) -> http.client.HTTPResponse:
-        """The answer, with its body in `.content`."""
+    def get(self, path: str = "", **headers: str) -> http.client.HTTPResponse:
+        """The answer, with its body in `.content`; a path without a slash is below the role's."""
         connection = http.client.HTTPConnection("127.0.0.1", self.server.port, timeout=5)
         cookie = {"Cookie": self.cookie} if self.cookie else {}
         named = {name.replace("_", "-"): value for name, value in headers.items()}
-        connection.request("GET", path, headers={"Host": self.host, **cookie, **named})
+        address = path if path.startswith(("/", "http")) else self.path + path
+        connection.request("GET", address, headers={"Host": self.host, **cookie, **named})
         response = connection.getresponse()
         response.content = response.read()  # type: ignore[attr-defined]
         connection.close()
         return response
 
-    def open(self, path: str = "/", origin: str | None = "own", host: str | None = None) -> ClientConnection:
+    def log_in(self, token: str, **headers: str) -> http.client.HTTPResponse:
+        """The answer to a token; its cookie and path are used from then on."""
+        answer = self.get("/login", Authorization=f"Bearer {token}", **headers)
+        if answer.status == 200:
+            self.cookie = answer.headers["Set-Cookie"].partition(";")[0]
+            self.path = json.loads(answer.content)["path"]  # type: ignore[attr-defined]
+        return answer
+
+    def raw_request(self, path: str = "") -> bytes:
+        """The bytes of a request, to be sent by hand."""
+        return f"GET {self.path}{path} HTTP/1.1\r\nHost: {self.host}\r\nCookie: {self.cookie}\r\n\r\n".encode()
+
+    def open(self, path: str = "", origin: str | None = "own", host: str | None = None) -> ClientConnection:
         """A WebSocket; raises InvalidStatus where the server refuses it."""
         headers = [("Cookie", self.cookie)] if self.cookie else []
         if origin is not None:
             headers.append(("Origin", f"http://{self.host}" if origin == "own" else origin))
-        uri = f"ws://{host or self.host}{path}"
+        uri = f"ws://{host or self.host}{path if path.startswith('/') else self.path + path}"
         return connect(
             uri,
             sock=socket.create_connection(("127.0.0.1", self.server.port), timeout=5),

@@ -1,61 +1,255 @@
 """Who is let in: every access that viser leaves open is tried."""
 
 import contextlib
+import http.server
 import logging
 import socket
+import threading
 import time
 
 import pytest
+from server_client import Browser, until
 from websockets.exceptions import InvalidStatus
 
 from slviewer.errors import SlviewerError, UsageError
-from slviewer.server import connection
-from slviewer.server.access import Access
-from slviewer.server.secure import serve
+from slviewer.server import access, connection
+from slviewer.server.access import ROLES, Access, Refusal
+from slviewer.server.credentials import load_tokens
+from slviewer.server.secure import Serving, serve
 
 EVIL = "http://evil.example"
 
 
-def test_a_token_link_sets_a_cookie_and_leads_to_the_clean_address(server, stranger):
-    path = server.url.partition(str(server.port))[2]
-    answer = stranger.get(path)
-    assert answer.status == 303 and answer.headers["Location"] == "/"
-    cookie = answer.headers["Set-Cookie"]
+@pytest.mark.parametrize("role", ROLES)
+def test_a_link_is_exchanged_for_a_cookie_of_its_own_path(server, stranger, role):
+    origin, _, token = server.link(role).partition("/#")
+    assert origin == server.origin and "?" not in server.link(role)
+    answer = stranger.log_in(token)
+    cookie, grant = answer.headers["Set-Cookie"], server.access.grants[role]
+    assert f"slviewer_{server.port}_{role}=" in cookie and f"Path=/{role}-" in cookie and "Secure" not in cookie
     assert "HttpOnly" in cookie and "SameSite=Strict" in cookie and "no-store" in answer.headers["Cache-Control"]
-    stranger.cookie = cookie.partition(";")[0]
-    page = stranger.get("/")
-    assert page.status == 200 and b"<title>Viser</title>" in page.content
-    assert stranger.open().close() is None
+    assert token not in cookie and token not in str(answer.headers) and token.encode() not in answer.content
+    assert stranger.path == f"{grant.path}/"
+    if role != "project":
+        assert b"<title>Viser</title>" in stranger.get().content
+        assert stranger.open().close() is None
 
 
-def test_a_link_followed_from_another_site_still_arrives(server, stranger):
-    # a strict cookie is not sent along a redirect that began elsewhere: a page of our own must lead on
-    path = server.url.partition(str(server.port))[2]
-    link = {"Sec_Fetch_Site": "cross-site", "Sec_Fetch_Mode": "navigate", "Sec_Fetch_Dest": "document"}
-    answer = stranger.get(path, **link)
-    assert answer.status == 200 and "Set-Cookie" in answer.headers and b"location.replace" in answer.content
-    assert server.access.token.encode() not in answer.content
-    assert "script-src 'sha256-" in answer.headers["Content-Security-Policy"]
+def test_one_browser_holds_the_cookies_of_all_roles(browser, server):
+    context = browser.new_context()
+    operating, watching = context.new_page(), context.new_page()
+    requests = []
+    context.on("request", lambda request: requests.append(request))
+    for page, role in ((operating, "operate"), (watching, "watch")):
+        page.goto(server.link(role))
+        page.wait_for_url(f"**/{role}-*/")
+        assert server.access.grants[role].token not in page.content() + page.title()
+    assert until(lambda: {server.role(client) for client in server.viser.get_clients()} == {"operate", "watch"})
+    assert operating.url == f"{server.origin}{server.access.grants['operate'].path}/"
+    operating.reload()
+    assert until(lambda: "operate" in {server.role(client) for client in server.viser.get_clients()})
+    grants = [server.access.grants[role] for role in ("operate", "watch")]
+    assert {cookie["path"] for cookie in context.cookies()} == {grant.path for grant in grants}
+    sent = [r.url.partition("#")[0] + r.headers.get("referer", "") for r in requests]
+    assert not [one for one in sent for grant in grants if grant.token in one]
+    bare = context.new_page()  # the bare address leads on to where the last link led
+    bare.goto(server.origin)
+    bare.wait_for_url("**/watch-*/")
+    context.close()
 
 
-@pytest.mark.parametrize("path", ["/", "/index.html", "/projector", "/download/x", "/../../etc/passwd", "/%2e%2e/x"])
+def test_another_server_of_this_machine_is_sent_no_cookie(browser, server):
+    received = []
+
+    class Thief(http.server.BaseHTTPRequestHandler):
+        def do_GET(self):
+            received.append(self.headers["Cookie"])
+            self.send_response(200)
+            self.end_headers()
+
+        def log_message(self, *_):
+            pass
+
+    thief = http.server.HTTPServer(("127.0.0.1", 0), Thief)
+    threading.Thread(target=thief.serve_forever, daemon=True).start()
+    context = browser.new_context()
+    page = context.new_page()
+    try:
+        page.goto(server.link())
+        page.wait_for_url("**/operate-*/")
+        assert context.cookies()
+        page.evaluate(f"location.href = 'http://127.0.0.1:{thief.server_port}/operate'")
+        assert until(lambda: received) and not any(received)
+    finally:
+        context.close()
+        thief.shutdown()
+        thief.server_close()
+
+
+def test_a_pasted_link_opens_the_page_and_a_wrong_one_says_why(browser, server):
+    context = browser.new_context()
+    page = context.new_page()
+    page.goto(server.origin)
+    page.get_by_label("Link").fill("x" * 32)
+    page.get_by_role("button", name="Open").click()
+    page.get_by_text("not, or no longer, valid").wait_for()
+    page.get_by_label("Link").fill(server.link())
+    page.get_by_role("button", name="Open").click()
+    page.wait_for_url("**/operate-*/")
+    context.clear_cookies()
+    page.reload()
+    page.get_by_text("no longer valid").wait_for()
+    context.close()
+
+
+def test_a_one_time_link_opens_once(server, stranger):
+    token = server.one_time_link().partition("#")[2]
+    assert server.access.is_pending(token)
+    assert stranger.log_in(token).status == 200 and stranger.path.startswith("/operate-")
+    assert stranger.log_in(token).status == 403 and not server.access.is_pending(token)
+
+
+def test_a_one_time_link_expires(server, stranger, monkeypatch):
+    monkeypatch.setattr(access, "ONE_TIME_SECONDS", -1.0)
+    assert stranger.log_in(server.one_time_link().partition("#")[2]).status == 403
+
+
+def test_wrong_tokens_are_limited_and_lock_out_no_random_one(monkeypatch):
+    monkeypatch.setattr(access, "WRONG_TOKENS_SECONDS", 0.3)
+    rules = Access(1, {"watch": "aaaaaaaaaaaaaaaa"})
+    statuses = []
+    for n in range(access.WRONG_TOKENS + 2):
+        with pytest.raises(Refusal) as refused:
+            rules.exchange(f"guess number {n}", "192.0.2.1")
+        statuses.append(refused.value.status)
+    assert statuses == [403] * access.WRONG_TOKENS + [429] * 2
+    with pytest.raises(Refusal):  # what a person chose may be guessed
+        rules.exchange("aaaaaaaaaaaaaaaa", "192.0.2.1")
+    assert rules.exchange(rules.grants["operate"].token, "192.0.2.1").role == "operate"
+    assert rules.exchange("aaaaaaaaaaaaaaaa", "192.0.2.2").role == "watch"
+    time.sleep(0.35)
+    assert rules.exchange("aaaaaaaaaaaaaaaa", "192.0.2.1").role == "watch"
+
+
+def test_new_links_end_all_that_the_old_ones_opened(operator_server):
+    server = operator_server
+    browsers = {role: Browser(server, role) for role in ("operate", "watch")}
+    asking, other, watching = browsers["operate"].client(), browsers["operate"].client(), browsers["watch"].client()
+    old = {role: grant.token for role, grant in server.access.grants.items()}
+    server.renew_links(asking.number)
+    for client in (other, watching):
+        client.thread.join(3)
+        assert not client.thread.is_alive()
+    assert until(lambda: any(m["type"] == "RunJavascriptMessage" for m in asking.received))
+    (script,) = (m["source"] for m in asking.received if m["type"] == "RunJavascriptMessage")
+    once = script.partition("#")[2].rstrip('")')
+    asking.thread.join(6)
+    assert not asking.thread.is_alive()  # whether or not it went on to its new page
+    for role, browser in browsers.items():
+        assert browser.get().status == 403 and browser.log_in(old[role]).status == 403
+        assert browser.log_in(server.access.grants[role].token).status == 200 and browser.get().status == 200
+    assert Browser(server, None).log_in(once).status == 200
+
+
+@pytest.fixture
+def operator_server(tmp_path):
+    server = serve(Serving(port=0, token_file=tmp_path / "tokens.toml"))
+    yield server
+    server.stop()
+
+
+def test_tokens_stay_in_a_file_that_nobody_else_reads(operator_server, tmp_path):
+    file = tmp_path / "tokens.toml"
+    assert file.stat().st_mode & 0o777 == 0o600
+    assert load_tokens(file) == {role: grant.token for role, grant in operator_server.access.grants.items()}
+    operator_server.renew_links(0)
+    assert load_tokens(file)["operate"] == operator_server.access.grants["operate"].token
+    assert file.stat().st_mode & 0o777 == 0o600
+    file.chmod(0o644)
+    with pytest.raises(UsageError, match="chmod 600"):
+        load_tokens(file)
+
+
+@pytest.mark.parametrize(
+    "content", ["", "operate = 5", "other = 'x'", "operate", "a = [" + "[" * 3000, "\xff", "operate = 'short'"]
+)
+def test_a_file_of_no_tokens_is_refused(tmp_path, content):
+    file = tmp_path / "tokens.toml"
+    file.write_text(content)
+    file.chmod(0o600)
+    with pytest.raises(UsageError):
+        serve(Serving(port=0, token_file=file))
+
+
+ROUTES = {
+    "": {"operate": 200, "watch": 200, "project": 200},
+    "favicon.ico": {"operate": 204, "watch": 204, "project": 204},
+    "projector": {"operate": 303, "watch": 404, "project": 404},
+    "download/{offered}": {"operate": 200, "watch": 200, "project": 404},
+    "download/x": {"operate": 404, "watch": 404, "project": 404},
+    "login": {"operate": 404, "watch": 404, "project": 404},
+    "x": {"operate": 404, "watch": 404, "project": 404},
+}
+"""Statuses of what stands below the path of each role."""
+
+
+@pytest.mark.parametrize("role", ROLES)
+def test_every_route_of_every_role(server, stranger, role, tmp_path):
+    async def handle(connection):
+        await connection.send("projector page")
+
+    (tmp_path / "a.txt").write_text("a")
+    offered = server.downloads.offer(tmp_path / "a.txt", within=tmp_path).partition("/")[2]
+    server.projector.html, server.projector.handler = b"page", handle
+    mine = Browser(server, role)
+    for route, statuses in ROUTES.items():
+        path = route.format(offered=offered)
+        assert mine.get(path).status == statuses[role], (route, role)
+        stranger.path = mine.path
+        assert stranger.get(path).status == 403, "the path alone opens nothing"
+        for other in ROLES:
+            if other != role:
+                theirs = Browser(server, other)
+                theirs.path = mine.path
+                assert theirs.get(path).status == 403, "nor does the cookie of another role"
+                with pytest.raises(InvalidStatus):
+                    theirs.open(path)
+        if path:
+            with pytest.raises(InvalidStatus):
+                mine.open(path)
+    with mine.open() as socket_:
+        if role == "project":
+            assert socket_.recv(2) == "projector page"
+    server.projector.handler = None
+
+
+@pytest.mark.parametrize(
+    "path", ["/index.html", "/projector", "/download/x", "/../../etc/passwd", "/%2e%2e/x", "/login"]
+)
 def test_without_a_token_there_is_nothing_to_see(stranger, path):
     answer = stranger.get(path)
-    assert answer.status in (403, 404) and len(answer.content) < 200
+    assert answer.status in (401, 403, 404) and len(answer.content) < 200
+
+
+def test_the_page_that_takes_a_link_holds_no_secret(server, stranger):
+    content = stranger.get("/").content.decode()
+    for grant in server.access.grants.values():
+        assert not any(one in content for one in (grant.token, grant.value, grant.path))
 
 
 @pytest.mark.parametrize("cookie", ["", "wrong", "é", "T" * 200])
-def test_a_wrong_token_opens_nothing(stranger, cookie):
-    stranger.cookie = f"slviewer_{stranger.server.port}={cookie}".encode().decode("latin-1")
-    assert stranger.get("/").status == 403
-    assert stranger.get("/?token=" + "x" * 32).status == 403
+def test_a_wrong_cookie_opens_nothing(server, stranger, cookie):
+    grant = server.access.grants["operate"]
+    stranger.path = f"{grant.path}/"
+    stranger.cookie = f"{grant.cookie_name}={cookie}".encode().decode("latin-1")
+    assert stranger.get().status == 403
     with pytest.raises(InvalidStatus) as refused:
         stranger.open()
     assert refused.value.response.status_code == 403
 
 
 def test_the_refusal_says_what_to_do(stranger):
-    assert b"open the link" in stranger.get("/").content
+    assert b"open the link" in stranger.get("/x").content
 
 
 @pytest.mark.parametrize(
@@ -63,7 +257,7 @@ def test_the_refusal_says_what_to_do(stranger):
 )
 def test_a_rebound_host_name_is_refused(operator, host):
     name = host.format(port=operator.server.port)
-    assert operator.get("/", Host=name).status == 421
+    assert operator.get("", Host=name).status == 421
     with pytest.raises(InvalidStatus) as refused:
         operator.open(host=name, origin=f"http://{name}")
     assert refused.value.response.status_code == 421
@@ -71,13 +265,12 @@ def test_a_rebound_host_name_is_refused(operator, host):
 
 def test_localhost_is_this_host_too(operator):
     operator.host = f"localhost:{operator.server.port}"
-    assert operator.get("/").status == 200
+    assert operator.get("").status == 200
 
 
 def test_two_hosts_are_none(operator):
     with socket.create_connection(("127.0.0.1", operator.server.port)) as raw:
-        lines = f"GET / HTTP/1.1\r\nHost: {operator.host}\r\nHost: evil\r\nCookie: {operator.cookie}\r\n\r\n"
-        raw.sendall(lines.encode())
+        raw.sendall(operator.raw_request().replace(b"\r\n", b"\r\nHost: evil\r\n", 1))
         assert b"421" in raw.recv(100)
 
 
@@ -89,45 +282,41 @@ def test_another_pages_websocket_is_refused_even_with_the_cookie(operator, origi
 
 
 def test_another_pages_request_is_refused_even_with_the_cookie(operator):
-    assert operator.get("/", Origin=EVIL).status == 403
+    assert operator.get("", Origin=EVIL).status == 403
     # another port of this machine is the same site, so that the strict cookie is sent along
+    assert operator.get("", Sec_Fetch_Site="same-site", Sec_Fetch_Mode="no-cors", Sec_Fetch_Dest="script").status == 403
     assert (
-        operator.get("/", Sec_Fetch_Site="same-site", Sec_Fetch_Mode="no-cors", Sec_Fetch_Dest="script").status == 403
+        operator.get("", Sec_Fetch_Site="cross-site", Sec_Fetch_Mode="navigate", Sec_Fetch_Dest="iframe").status == 403
     )
-    assert (
-        operator.get("/", Sec_Fetch_Site="cross-site", Sec_Fetch_Mode="navigate", Sec_Fetch_Dest="iframe").status == 403
-    )
-    assert operator.get("/", Sec_Fetch_Site="same-origin", Sec_Fetch_Mode="cors", Sec_Fetch_Dest="empty").status == 200
+    assert operator.get("", Sec_Fetch_Site="same-origin", Sec_Fetch_Mode="cors", Sec_Fetch_Dest="empty").status == 200
 
 
-@pytest.mark.parametrize(
-    "query", ["websocket=ws://evil", "playbackPath=http://evil/x.viser", "token={token}&websocket=ws://evil", "x", ""]
-)
-def test_parameters_that_make_the_page_load_foreign_messages_are_refused(operator, query):
-    answer = operator.get("/?" + query.format(token=operator.server.access.token))
-    assert answer.status == 400 and "Set-Cookie" not in answer.headers
-
-
-def test_a_token_in_a_websockets_address_counts_for_nothing(server, stranger):
-    with pytest.raises(InvalidStatus):
-        stranger.open(f"/?token={server.access.token}")
+@pytest.mark.parametrize("query", ["websocket=ws://evil", "playbackPath=http://evil/x.viser", "token={token}", "x", ""])
+def test_addresses_take_no_parameters(operator, query):
+    token = operator.server.access.grants["operate"].token
+    for path in ("", "/", "/login"):
+        answer = operator.get(f"{path}?{query.format(token=token)}")
+        assert answer.status == 400 and "Set-Cookie" not in answer.headers
+    if query:
+        with pytest.raises(InvalidStatus):
+            operator.open(f"?{query}")
 
 
 @pytest.mark.parametrize("path", ["//evil.example/", "/\\evil.example/", "/a//b", "/a/../b", "http://evil.example/"])
-def test_no_link_leads_elsewhere(server, stranger, path):
-    answer = stranger.get(f"{path}?token={server.access.token}")
+def test_no_address_leads_elsewhere(stranger, path):
+    answer = stranger.get(path)
     assert answer.status == 404 and "Location" not in answer.headers
 
 
 def test_nothing_but_the_page_is_read_from_visers_folder(operator):
-    for path in ("/index.html", "/../package.json", "/%2e%2e/package.json", "/.git", "/x"):
+    for path in ("index.html", "../package.json", "%2e%2e/package.json", ".git", "x"):
         assert operator.get(path).status == 404
     with pytest.raises(InvalidStatus):
-        operator.open("/elsewhere")
+        operator.open("elsewhere")
 
 
 def test_every_answer_keeps_out_of_other_pages_and_of_caches(operator, stranger):
-    for answer in (operator.get("/"), stranger.get("/"), operator.get("/none"), operator.get("/?x=1")):
+    for answer in (operator.get(""), stranger.get("/"), operator.get("none"), operator.get("?x=1")):
         headers = answer.headers
         assert headers["X-Frame-Options"] == "DENY" and headers["X-Content-Type-Options"] == "nosniff"
         assert headers["Referrer-Policy"] == "no-referrer" and headers["Cache-Control"] == "no-store"
@@ -144,7 +333,7 @@ def test_other_methods_and_half_requests_end_without_noise(operator, caplog):
                 raw.shutdown(socket.SHUT_WR)
                 raw.settimeout(3)
                 assert b"200 OK" not in raw.recv(1000)
-        assert operator.get("/").status == 200
+        assert operator.get("").status == 200
     assert not [record for record in caplog.records if record.levelno >= logging.WARNING]
 
 
@@ -159,15 +348,14 @@ def test_whoever_asks_for_nothing_is_let_go(server, monkeypatch):
 
 def test_an_ipv6_address_is_one_too():
     try:
-        server = serve("::1", port=0)
+        server = serve(Serving("::1", 0))
     except SlviewerError:
         pytest.skip("this machine has no IPv6")
     try:
-        assert server.loopback and server.url.startswith(f"http://[::1]:{server.port}/?token=")
+        assert server.loopback and server.link().startswith(f"http://[::1]:{server.port}/#")
         with socket.create_connection(("::1", server.port)) as raw:
-            path = server.url.partition(f":{server.port}")[2]
-            raw.sendall(f"GET {path} HTTP/1.1\r\nHost: [::1]:{server.port}\r\n\r\n".encode())
-            assert raw.recv(100).startswith(b"HTTP/1.1 303")
+            raw.sendall(f"GET / HTTP/1.1\r\nHost: [::1]:{server.port}\r\n\r\n".encode())
+            assert raw.recv(100).startswith(b"HTTP/1.1 200")
     finally:
         server.stop()
 
@@ -175,7 +363,7 @@ def test_an_ipv6_address_is_one_too():
 def test_a_taken_port_is_an_error_at_once(server):
     start = time.monotonic()
     with pytest.raises(SlviewerError, match="--port"):
-        serve(port=server.port)
+        serve(Serving(port=server.port))
     assert time.monotonic() - start < 2
 
 
@@ -183,7 +371,7 @@ def test_a_taken_port_is_an_error_at_once(server):
 def test_an_unusable_address_is_an_error_at_once(host):
     start = time.monotonic()
     with pytest.raises(SlviewerError):
-        serve(host, port=0)
+        serve(Serving(host, 0))
     assert time.monotonic() - start < 2
 
 
@@ -191,40 +379,39 @@ def test_a_slow_name_server_is_not_waited_for(monkeypatch):
     monkeypatch.setattr(socket, "getaddrinfo", lambda *_, **__: time.sleep(3) or [])
     start = time.monotonic()
     with pytest.raises(SlviewerError, match=r"127\.0\.0\.1"):
-        serve("slow.example", port=0)
+        serve(Serving("slow.example", 0))
     assert time.monotonic() - start < 2
 
 
 def test_it_serves_this_machine_alone_unless_told(server):
-    assert server.host == "127.0.0.1" and server.loopback
-    assert server.url.startswith(f"http://127.0.0.1:{server.port}/?token=")
+    assert server.serving.host == "127.0.0.1" and server.loopback
+    assert server.link().startswith(f"http://127.0.0.1:{server.port}/#")
     others = [info[4][0] for info in socket.getaddrinfo(socket.gethostname(), None, socket.AF_INET)]
     for address in {one for one in others if not one.startswith("127.")}:
         with pytest.raises(OSError):
             socket.create_connection((address, server.port), timeout=0.5)
 
 
-def test_tokens_are_long_and_two():
-    access = Access(1, None, None)
-    assert len(access.token) >= 32 and access.token != access.view_token
-    assert (access.role_of(access.token), access.role_of(access.view_token)) == ("operator", "viewer")
-    assert access.role_of("") is None and access.role_of("\udce9") is None
-    with pytest.raises(UsageError):
-        Access(1, "short", None)
-    with pytest.raises(UsageError):
-        Access(1, "T" * 20, "T" * 20)
-    with pytest.raises(UsageError):
-        Access(1, "T" * 20 + "; Path=/", None)
+def test_tokens_are_long_and_differ():
+    grants = Access(1).grants.values()
+    assert all(len(grant.token) >= 32 for grant in grants)
+    assert len({one for grant in grants for one in (grant.token, grant.value, grant.path)}) == 9
+    for token in ("", "\udce9", "x" * 300):
+        with pytest.raises(Refusal):
+            Access(1).exchange(token, "127.0.0.1")
+    for tokens in ({"operate": "short"}, {"operate": "T" * 20, "watch": "T" * 20}, {"watch": "T" * 20 + "; Path=/"}):
+        with pytest.raises(UsageError):
+            Access(1, tokens)
 
 
 def test_on_a_network_it_answers_to_its_address_its_name_and_those_given():
-    access = Access(8080, None, None, ("scanner.lab", "scan.example:443"))
+    rules = Access(8080, names=("scanner.lab", "scan.example:443"))
 
     def answers(host: str, local: str) -> bool:
         from websockets.datastructures import Headers
 
         try:
-            return bool(access.host(Headers({"Host": host}), local))
+            return bool(rules.host(Headers({"Host": host}), local))
         except Exception:
             return False
 

@@ -15,7 +15,6 @@ from websockets.exceptions import InvalidStatus
 
 from slviewer.errors import InputError
 from slviewer.server import connection
-from slviewer.server.auth_middleware import Route
 from slviewer.server.connection import CHUNK
 from slviewer.server.text import escape, safe_name
 
@@ -34,7 +33,7 @@ def test_an_offered_file_arrives_whole(operator, watcher, stranger, tmp_path):
         disposition = answer.headers["Content-Disposition"]
         assert disposition.startswith("attachment; ") and "filename*=UTF-8''scan%20_%C3%A9_.ply" in disposition
         assert answer.headers["X-Content-Type-Options"] == "nosniff"
-    assert stranger.get(address).status == 403
+    assert stranger.get(address).status == 403 and Browser(operator.server, "project").get(address).status == 404
     downloads.clear()
     assert operator.get(address).status == 404
 
@@ -76,7 +75,7 @@ def test_a_file_that_becomes_a_link_is_no_longer_sent(operator, tmp_path):
     operator.server.downloads.clear()
 
 
-@pytest.mark.parametrize("path", ["/download", "/download/", "/download/x", "/download/../secret", "/download/x/y"])
+@pytest.mark.parametrize("path", ["download", "download/", "download/x", "download/../secret", "download/x/y"])
 def test_addresses_that_were_not_offered_are_nothing(operator, path):
     assert operator.get(path).status == 404
 
@@ -87,13 +86,13 @@ def test_a_slow_reader_of_a_large_file_costs_little_and_stops_nobody(operator, t
         file.truncate(size)
     address = operator.server.downloads.offer(tmp_path / "large.bin", within=tmp_path)
     with socket.create_connection(("127.0.0.1", operator.server.port)) as slow:
-        slow.sendall(f"GET {address} HTTP/1.1\r\nHost: {operator.host}\r\nCookie: {operator.cookie}\r\n\r\n".encode())
+        slow.sendall(operator.raw_request(address))
         assert slow.recv(100).startswith(b"HTTP/1.1 200")
         start = time.monotonic()
-        assert operator.get("/").status == 200
+        assert operator.get().status == 200
         assert hashlib.md5(operator.get(address).content).digest() == hashlib.md5(bytes(size)).digest()
         assert time.monotonic() - start < 3
-    assert operator.get("/").status == 200  # the reader that left half-way did no harm
+    assert operator.get().status == 200  # the reader that left half-way did no harm
 
 
 def test_a_reader_who_takes_nothing_is_let_go(operator, tmp_path, monkeypatch):
@@ -102,9 +101,7 @@ def test_a_reader_who_takes_nothing_is_let_go(operator, tmp_path, monkeypatch):
         file.truncate(512 * CHUNK)
     address = operator.server.downloads.offer(tmp_path / "large.bin", within=tmp_path)
     with socket.create_connection(("127.0.0.1", operator.server.port)) as stalled:
-        stalled.sendall(
-            f"GET {address} HTTP/1.1\r\nHost: {operator.host}\r\nCookie: {operator.cookie}\r\n\r\n".encode()
-        )
+        stalled.sendall(operator.raw_request(address))
         time.sleep(0.6)
         stalled.settimeout(2)
         received = 0
@@ -114,36 +111,40 @@ def test_a_reader_who_takes_nothing_is_let_go(operator, tmp_path, monkeypatch):
         assert received < 512 * CHUNK
 
 
-def test_pages_and_endpoints_stand_beside_the_wizard(server, operator, watcher, stranger):
+def test_the_projector_page_has_a_link_of_its_own(server, operator, watcher, projector_page, stranger):
     async def echo(connection) -> None:
         async for message in connection:
             await connection.send(f"{connection.role}: {message}")
 
-    server.routes["/projector"] = Route(PAGE.encode(), echo)
-    answer = operator.get("/projector")
+    server.projector.html, server.projector.handler = PAGE.encode(), echo
+    answer = projector_page.get()
     assert answer.status == 200 and answer.content.decode() == PAGE
     script = base64.b64encode(hashlib.sha256(b"let a = 1").digest()).decode()
     assert f"script-src 'sha256-{script}';" in answer.headers["Content-Security-Policy"]
-    with operator.open("/projector") as socket_:
+    with projector_page.open() as socket_:
         socket_.send("hello")
-        assert socket_.recv(2) == "operator: hello"
-    assert watcher.get("/projector").status == 403 and stranger.get("/projector").status == 403
-    for browser, origin in ((watcher, "own"), (stranger, "own"), (operator, "http://evil.example"), (operator, None)):
+        assert socket_.recv(2) == "project: hello"
+    for origin in ("http://evil.example", None):
         with pytest.raises(InvalidStatus):
-            browser.open("/projector", origin=origin)
-    link = server.link("/projector").partition(str(server.port))[2]
-    assert stranger.get(link).headers["Location"] == "/projector"
-    del server.routes["/projector"]
-    assert operator.get("/projector").status == 404
+            projector_page.open(origin=origin)
+    led = operator.get("projector")  # the operator is led to that page, with its rights alone
+    assert led.status == 303 and led.headers["Location"] == projector_page.path
+    assert led.headers["Set-Cookie"].startswith(f"{projector_page.cookie};")
+    assert watcher.get("projector").status == 404 and stranger.get("/projector").status == 403
+    server.projector.handler = None
+    assert projector_page.get().status == 404 and operator.get("projector").status == 404
+    with pytest.raises(InvalidStatus):
+        projector_page.open()
 
 
-def test_a_failing_endpoint_takes_nothing_with_it(server, operator):
+def test_a_failing_endpoint_takes_nothing_with_it(server, operator, projector_page):
     async def fail(connection) -> None:
         raise RuntimeError("broken")
 
-    server.routes["/fail"] = Route(b"", fail)
-    socket_ = operator.open("/fail")
+    server.projector.handler = fail
+    socket_ = projector_page.open()
     assert until(lambda: socket_.close_code == 1011)
+    server.projector.handler = None
     assert operator.client().number >= 0
 
 
@@ -202,21 +203,21 @@ def test_long_names_are_cut_and_keep_their_suffix():
 
 
 def test_the_server_stops_and_its_port_is_free_again(tmp_path):
-    from slviewer.server.secure import serve
+    from slviewer.server.secure import Serving, serve
 
     with (tmp_path / "large.bin").open("wb") as file:
         file.truncate(512 * CHUNK)
-    server = serve(port=0)
-    browser = Browser(server, server.access.token)
+    server = serve(Serving(port=0))
+    browser = Browser(server, "operate")
     client = browser.client()
     address = server.downloads.offer(tmp_path / "large.bin", within=tmp_path)
     with socket.create_connection(("127.0.0.1", server.port)) as slow:
-        slow.sendall(f"GET {address} HTTP/1.1\r\nHost: {browser.host}\r\nCookie: {browser.cookie}\r\n\r\n".encode())
+        slow.sendall(browser.raw_request(address))
         slow.recv(100)
         start = time.monotonic()
         server.stop()
         assert time.monotonic() - start < 3
     client.thread.join(3)
     assert not client.thread.is_alive()
-    again = serve(port=server.port)
+    again = serve(Serving(port=server.port))
     again.stop()

@@ -1,12 +1,18 @@
 """What a client may change: every message that viser would obey and ours must not is sent to a live server."""
 
+import dataclasses
 import math
+from functools import partial
 
 import msgspec
 import pytest
 from server_client import CAMERA, announced, settle, until
 
 from slviewer.errors import SlviewerError
+from slviewer.server import viser_internals
+from slviewer.server.access import ROLES, MessageRefused
+from slviewer.server.gate import MESSAGES, ViserGate
+from slviewer.server.uploads import UploadBudget
 
 
 def test_the_operator_works(operator, gui):
@@ -17,7 +23,7 @@ def test_the_operator_works(operator, gui):
     button.on_click(lambda _: got.append("click"))
     client = operator.client()
     assert until(lambda: any(m["type"] == "GuiSliderMessage" for m in client.received))
-    assert operator.server.role(client.number) == "operator"
+    assert operator.server.role(client.number) == "operate"
     client.set(slider, 7)
     assert until(lambda: got == [(client.number, 7.0)]) and isinstance(slider.value, float)
     client.set(button, True)
@@ -135,7 +141,7 @@ def test_a_watcher_sees_all_and_changes_nothing(server, operator, watcher, gui):
         register(lambda event: calls.append(event))
     server.viser.scene.on_click()(lambda event: calls.append(event))
     client = watcher.client()
-    assert server.role(client.number) == "viewer"
+    assert server.role(client.number) == "watch"
     assert until(lambda: {"GuiSliderMessage", "TransformControlsMessage"} <= {m["type"] for m in client.received})
     client.set(slider, 7)
     client.set(button, True)
@@ -273,3 +279,82 @@ def test_garbage_hurts_nobody(server, operator, gui, capsys):
     settle(client)
     assert slider.value == 5 and server.viser.get_clients()[client.number].camera.image_width == 1280
     assert "Traceback" not in capsys.readouterr().err
+
+
+ALLOWED = {
+    "operate": {
+        *("ViewerCameraMessage", "GuiUpdateMessage", "CommandTriggerMessage", "LocalStorageGetItemResponseMessage"),
+        *("FileTransferStartUpload", "FileTransferPart", "TransformControlsUpdateMessage"),
+        *("TransformControlsDragStartMessage", "TransformControlsDragEndMessage"),
+        *("SceneNodeClickMessage", "ScenePointerMessage"),
+    },
+    "watch": {"ViewerCameraMessage", "LocalStorageGetItemResponseMessage"},
+    "project": set(),
+}
+"""The messages that are considered at all; whether one passes depends on what the page offers at the moment."""
+VALUES = {str: "/x", int: 1, float: 1.0, bool: True, bytes: b"x"}
+
+
+def every_message() -> list[type]:
+    """All messages of viser's protocol, of either direction."""
+    found, waiting = [], [viser_internals.Message]
+    while waiting:
+        kinds = waiting.pop().__subclasses__()
+        found += kinds
+        waiting += kinds
+    return found
+
+
+def example(kind: type) -> dict:
+    """Fields for a message of this kind; CAMERA and POINTER where those are known."""
+    known = {"ViewerCameraMessage": CAMERA, "ScenePointerMessage": POINTER}.get(kind.__name__)
+    return known or {field.name: VALUES.get(field.type, "/x") for field in dataclasses.fields(kind)}
+
+
+@pytest.mark.parametrize("role", ROLES)
+def test_every_message_of_the_protocol_for_every_role(server, operator, role, monkeypatch):
+    client = operator.client()  # whatever the role, the gate is that of a connected client
+    connection = viser_internals.connection_of(server.viser, client.number)
+    gate = ViserGate(server.viser, connection, role, UploadBudget(1000))
+    considered = set()
+    monkeypatch.setattr(gate, "_check_message", partial(note_considered, gate._check_message, considered))
+    monkeypatch.setattr(gate, "_send_refusal", lambda *_: None)
+    passed = set()
+    kinds = every_message()
+    assert len(kinds) > 100 and all(name in {kind.__name__ for kind in kinds} for name in ALLOWED["operate"])
+    for kind in kinds:
+        raw = msgspec.msgpack.encode({"type": kind.__name__, **example(kind)})
+        if gate(raw) is not None:
+            passed.add(kind.__name__)
+    assert considered <= ALLOWED[role] and passed <= ALLOWED[role]
+    passed.discard("ScenePointerMessage")  # something may listen to the pointer
+    assert passed == ({"ViewerCameraMessage"} if role != "project" else set()), "nothing else is offered at present"
+    assert {kind.__name__ for kind in MESSAGES[role]} == ALLOWED[role]
+
+
+def note_considered(check, considered: set, message, raw):
+    """Check a message, and note its kind unless the role may not send it at all."""
+    try:
+        passed = check(message, raw)
+    except MessageRefused as refused:
+        if str(refused) != "not for this link":
+            considered.add(type(message).__name__)
+        raise
+    considered.add(type(message).__name__)
+    return passed
+
+
+def test_what_an_operator_types_into_a_private_input_reaches_no_watcher(server, operator, watcher, gui):
+    secret = "rtsp://admin:hunter2@camera/stream"
+    address = gui.add_text("Camera ID", "")
+    viser_internals.make_private(address)
+    typing, other, watching = operator.client(), operator.client(), watcher.client()
+    typing.set(address, secret)
+    assert until(lambda: address.value == secret)
+    watching.set(address, "x")  # is refused, and answered with the true value where it is no secret
+    settle(typing)
+    viser_internals.send_private_values(server.viser, other.number)
+    assert until(lambda: other.told(address) == [secret])
+    late = watcher.client()
+    settle(typing)
+    assert "hunter2" not in str(watching.received) + str(late.received)

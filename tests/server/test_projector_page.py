@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser, Page, expect
 from server_client import until
-from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.exceptions import ConnectionClosed
 
 from slviewer.devices.browser import BrowserProjector, browser_projector
 from slviewer.devices.channel import Channel
@@ -17,8 +17,8 @@ from slviewer.errors import DeviceError, InputError
 from slviewer.fringe.patterns import render
 from slviewer.fringe.presets import complementary
 from slviewer.fringe.sequence import Frame, PatternSequence
-from slviewer.server.projector_page import PATH, serve_projector
-from slviewer.server.secure import SafeServer, serve
+from slviewer.server.projector_page import serve_projector
+from slviewer.server.secure import SafeServer, Serving, serve
 
 SIZE = (360, 270)
 SEQUENCE = complementary(SIZE)
@@ -34,7 +34,7 @@ def channel(server: SafeServer) -> Iterator[Channel]:
     channel = Channel()
     serve_projector(server, channel)
     yield channel
-    del server.routes[PATH]
+    server.projector.handler = None
 
 
 @pytest.fixture
@@ -50,8 +50,8 @@ def opens(browser: Browser, server: SafeServer) -> Iterator[Opens]:
         contexts.append(context)
         page = context.new_page()
         page.on("pageerror", lambda error: errors.append(str(error)))
-        page.goto(server.link(PATH))
-        assert page.url.endswith(PATH), "the token must not stay in the address"
+        page.goto(server.link("project"))
+        page.wait_for_url("**/project-*/")  # the token does not stay in the address
         return page
 
     yield opened
@@ -264,16 +264,16 @@ def test_a_lost_connection_is_made_again_by_the_page(opens, channel, projector):
     assert shows(page, render(SEQUENCE, 2))
 
 
-def test_a_server_that_starts_again_finds_its_page(browser, channel):
-    server = serve(port=0)
+def test_a_server_that_starts_again_finds_its_page(browser, channel, tmp_path):
+    server = serve(Serving(port=0, token_file=tmp_path / "tokens.toml"))
     serve_projector(server, channel)
     page = browser.new_page(viewport={"width": 360, "height": 270})
-    page.goto(server.link(PATH))
+    page.goto(server.link("project"))
     assert channel.wait_ready(5.0).state == "ready"
     server.stop()
     expect(page.locator("h1")).to_have_text("slviewer does not answer")
     assert channel.page_state().state == "waiting"
-    again = serve(port=server.port, token=server.access.token, view_token=server.access.view_token)
+    again = serve(server.serving)
     serve_projector(again, channel)
     assert channel.wait_ready(8.0).state == "ready"
     page.close()
@@ -350,22 +350,21 @@ def test_a_second_window_takes_over_only_when_it_is_asked_to(opens, channel, pro
     assert shows(second, render(SEQUENCE, 3))
 
 
-def test_the_page_is_the_operators_alone(browser, server, channel, operator, watcher, stranger):
-    assert operator.get(PATH).status == 200
-    for other in (watcher, stranger):
-        assert other.get(PATH).status == 403
-        with pytest.raises(InvalidStatus):
-            other.open(PATH)
-    page = browser.new_page()
-    assert page.goto(f"http://127.0.0.1:{server.port}{PATH}").status == 403
-    page.close()
-    assert channel.page_state().state == "waiting"
+def test_the_operator_is_led_to_the_page_with_its_rights_alone(browser, server, channel, projector_page):
+    context = browser.new_context(viewport={"width": SIZE[0], "height": SIZE[1]})
+    page = context.new_page()
+    page.goto(server.link())
+    page.wait_for_url("**/operate-*/")
+    page.goto(page.url + "projector")
+    assert page.url.endswith(projector_page.path)
+    assert channel.wait_ready(5.0).state == "ready"
+    context.close()
 
 
-def test_nonsense_ends_its_own_connection_only(opens, channel, projector, operator):
+def test_nonsense_ends_its_own_connection_only(opens, channel, projector, projector_page):
     opens()
     ready(channel, projector)
-    with operator.open(PATH) as socket_:
+    with projector_page.open() as socket_:
         socket_.send("nonsense")
         with pytest.raises(ConnectionClosed):
             socket_.recv(3)

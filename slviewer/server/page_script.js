@@ -27,3 +27,6 @@
     },
   });
 })();
+// viser writes the address of its WebSocket into the page's own, unless it has no path. Here every page has one, and the
+// address stays as it is.
+history.replaceState = () => {};

@@ -2,7 +2,7 @@
 
 from playwright.sync_api import Browser
 
-from slviewer.server.viser_internals import ONE_DRAW, client_page
+from slviewer.server.viser_internals import PAGE_SCRIPT, client_page
 
 WORKER = """async () => {
   const text = `for (let i = 0; i < 20; i++)
@@ -28,7 +28,7 @@ WORKER = """async () => {
 def test_batches_that_wait_are_one_and_keep_their_order(browser: Browser) -> None:
     context = browser.new_context()
     page = context.new_page()
-    page.add_script_tag(content=ONE_DRAW.decode())
+    page.add_script_tag(content=PAGE_SCRIPT.decode())
     found = page.evaluate(WORKER)
     context.close()
     whole = [each for batch in found["arrived"] for each in (batch if isinstance(batch, list) else [batch])]
@@ -39,4 +39,4 @@ def test_batches_that_wait_are_one_and_keep_their_order(browser: Browser) -> Non
 
 def test_the_script_runs_before_visers_own() -> None:
     page = client_page()
-    assert 0 < page.index(ONE_DRAW) < page.index(b"<script data-p=")
+    assert 0 < page.index(PAGE_SCRIPT) < page.index(b"<script data-p=")
