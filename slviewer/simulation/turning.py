@@ -23,15 +23,15 @@ _RADIUS_MM, _FOOT_MM = 56.0, 27.0
 _SUBDIVISIONS = 7  # edges of about half a millimetre
 
 
-def turning() -> dict[str, MeshScene]:
-    """The worn stone in twelve steps of the table, turn_01 ... turn_12: the camera sees all of it but its flat foot."""
+def turning(steps: int = STEPS) -> dict[str, MeshScene]:
+    """The worn stone in equal steps of the table, turn_01, turn_02 ...: the camera sees all of it but its flat foot."""
     vertices, triangles = stone()
     side = np.cross(AXIS, [0.0, 0.0, 1.0])
     side /= np.linalg.norm(side)
     upright = np.stack([side, np.cross(AXIS, side), AXIS], axis=1)
     scenes = {}
-    for k in range(STEPS):
-        R = rotation(np.radians(STEP_DEG * k) * AXIS) @ upright
+    for k in range(steps):
+        R = rotation(2 * np.pi * k / steps * AXIS) @ upright
         scenes[f"turn_{k + 1:02d}"] = MeshScene(vertices, triangles, Pose(R, AXIS_POINT + R @ _AXIS_OFFSET_MM))
     return scenes
 

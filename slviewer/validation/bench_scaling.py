@@ -1,9 +1,12 @@
 """How time and memory grow with pixels, target poses, scans merged and captures of a session."""
 
 import shutil
+import subprocess
+import sys
 import tempfile
 import tracemalloc
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +19,7 @@ from slviewer.calibration.stereo import calibrate_stereo
 from slviewer.fringe.decode import decode
 from slviewer.fringe.presets import p18
 from slviewer.fringe.sequence import PatternSequence, one_axis
+from slviewer.pipeline.batch import batch
 from slviewer.pipeline.capture_phases import decode_frames, texture_8bit
 from slviewer.pipeline.feedback import Progress, ignore_progress
 from slviewer.pipeline.poses import read_pose
@@ -26,17 +30,24 @@ from slviewer.session.store import Session
 from slviewer.simulation.plans import letter_plan
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import SimulatedRig, letter
-from slviewer.simulation.turning import STEP_DEG, turning
+from slviewer.simulation.turning import turning
 from slviewer.target.board import Board
+from slviewer.validation.bench_live import true_calibration
 from slviewer.validation.bench_rows import median, row
 from slviewer.wizard.planner import Planner
 from slviewer.wizard.session_reader import SessionReader
 from slviewer.wizard.snapshot import RigView
 
 MEGAPIXELS = (0.5, 2.0, 8.0, 24.0)
-POSES = (10, 20, 40)
-SCANS = (3, 6, 12)
+WHOLE_MEGAPIXELS = (2.0, 8.0, 24.0)
+"""Of captures that are read, decoded, reconstructed and written."""
+POSES = (10, 40, 200)
+SCANS = (3, 12, 50)
 CAPTURES = (50, 150, 500)
+WORKERS = (1, 2)
+BATCH = 8
+"""Captures of a batch."""
+MOST_MB = 16_000.0
 SCALE = 0.25
 """Of the rig that poses and scans are rendered with."""
 NOISE_MM = 0.02
@@ -59,12 +70,16 @@ def time_scaling(progress: Progress = ignore_progress) -> list[Row]:
     rows += _time_scans(rig)
     progress(0.5, "reading poses")
     rows += _time_poses(rig, plan)
+    progress(0.8, "whole captures")
+    rows += _time_whole_captures(plan["pose_01"])
+    progress(0.95, "batches")
+    rows += _time_batches(plan["pose_01"])
     progress(1.0, "measured")
     return rows
 
 
 def _measure_growth(kind: str, sizes: tuple[float, ...], work: Callable[[float], Callable[[], object]]) -> list[Row]:
-    """Time ``work(size)()`` for each size; the last row's note is the exponent fitted to all of them."""
+    """Time ``work(size)()`` for each size; the last row's note is what ``_describe_growth`` says of all of them."""
     seconds, rows = [], []
     for size in sizes:
         run = work(size)
@@ -75,10 +90,15 @@ def _measure_growth(kind: str, sizes: tuple[float, ...], work: Callable[[float],
         once = median(run, 1, warm=False)
         seconds.append(once if once > SLOW_S else median(run, 5, warm=False))
         rows.append(row(f"{kind}: {size:g}", seconds[-1], memory))
+    rows[-1]["note"] = _describe_growth(sizes, seconds)
+    return rows
+
+
+def _describe_growth(sizes: tuple[float, ...], seconds: list[float]) -> str:
+    """The exponent fitted to the seconds of all sizes, in words."""
     exponent = float(np.polyfit(np.log(sizes), np.log(seconds), 1)[0])
     verdict = "linear or better" if exponent <= LINEAR else "more than linear"
-    rows[-1]["note"] = f"grows with the power {exponent:.2f}: {verdict}"
-    return rows
+    return f"grows with the power {exponent:.2f}: {verdict}"
 
 
 def _time_pixels(rig: SimulatedRig, scene: Any) -> list[Row]:
@@ -119,16 +139,16 @@ def _time_captures(rig: SimulatedRig, scene: Any) -> list[Row]:
 def _time_scans(rig: SimulatedRig) -> list[Row]:
     """Rows of registering scans of an object on a turntable, with made-up noise."""
     rng, clouds = np.random.default_rng(0), {}
-    for name, scene in turning().items():
+    for name, scene in turning(max(SCANS)).items():
         points = Renderer(rig, scene).truth().points
         noisy = points + rng.normal(0, NOISE_MM, points.shape[:2])[..., None] * np.array([0.0, 0.0, 1.0])
         clouds[name] = Cloud(noisy, "x", "splined", np.full(points.shape[:2], NOISE_MM))
-    names = list(clouds)
+    names, step_deg = list(clouds), 360.0 / max(SCANS)
 
     def register(count: float) -> Callable[[], object]:
         """Return the registration of the first so many scans."""
         chosen = {name: clouds[name] for name in names[: int(count)]}
-        return lambda: register_all(chosen, names[0], Starts(step_deg=STEP_DEG))
+        return lambda: register_all(chosen, names[0], Starts(step_deg=step_deg))
 
     return _measure_growth("register scans of a turn", SCANS, register)
 
@@ -156,3 +176,67 @@ def _time_poses(rig: SimulatedRig, plan: dict[str, Any]) -> list[Row]:
         return fit
 
     return _measure_growth("calibrate poses, stereo and splined", POSES, calibrate)
+
+
+_RECONSTRUCTED = """
+import resource, sys, time
+from slviewer.pipeline.reconstruct import reconstruct
+begun = time.perf_counter()
+reconstruct(sys.argv[1], "scan_01")
+print(time.perf_counter() - begun, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+"""
+
+
+def _time_whole_captures(scene: Any) -> list[Row]:
+    """Rows of reconstructing captures of several sizes from disk to PLY, with the peak memory of the process."""
+    seconds, rows = [], []
+    for megapixels in WHOLE_MEGAPIXELS:
+        scale = float(np.sqrt(megapixels / 1.92))
+        with tempfile.TemporaryDirectory(prefix="slviewer-bench-") as folder:
+            _save_scans(Path(folder, "session"), scale, scene, 1)
+            for _ in range(2):  # the first compiles
+                ran = subprocess.run(
+                    [sys.executable, "-c", _RECONSTRUCTED, str(Path(folder, "session"))],
+                    check=True,
+                    capture_output=True,
+                    text=True,
+                )
+        lasted, peak = map(float, ran.stdout.split()[-2:])
+        seconds.append(lasted)
+        memory = peak / (1e6 if sys.platform == "darwin" else 1e3)
+        rows.append(row(f"reconstruct a capture, MP: {megapixels:g}", lasted, memory))
+        rows[-1] |= {"target": f"{MOST_MB / 1e3:g} GB", "holds": "yes" if memory <= MOST_MB else "no"}
+    rows[-1]["note"] = f"{_describe_growth(WHOLE_MEGAPIXELS, seconds)}; MB: peak of the whole process"
+    return rows
+
+
+def _save_scans(session: Path, scale: float, scene: Any, count: int) -> None:
+    """Make a session with the rig's true calibration and so many equal scans."""
+    true_calibration(session, scale)
+    rig = letter(scale)
+    sequence = one_axis(p18(rig.projector.size), "x")
+    frames = Renderer(rig, scene).capture(sequence)
+    with Session.open(session, write=True) as store:
+        for number in range(1, count + 1):
+            store.save_capture(f"scan_{number:02d}", "scan", sequence, frames, source="simulated")
+
+
+def _time_batches(scene: Any) -> list[Row]:
+    """Rows of a batch of captures on one worker and on two; empty without the packages that batches need."""
+    try:
+        from distributed import Client, LocalCluster
+    except ImportError:
+        return []
+    rows: list[Row] = []
+    with tempfile.TemporaryDirectory(prefix="slviewer-bench-") as folder:
+        session = Path(folder, "session")
+        _save_scans(session, 1.0, scene, BATCH)
+        for workers in WORKERS:
+            with (
+                LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address=None) as cluster,
+                Client(cluster, set_as_default=False),
+            ):
+                work = partial(batch, [session], "reconstruct", scheduler=cluster.scheduler_address)
+                rows.append(row(f"batch of {BATCH} captures, workers: {workers}", median(work, 1)))
+    rows[-1]["note"] = f"{rows[0]['ms'] / rows[-1]['ms']:.2f} times as fast as one"
+    return rows
