@@ -30,7 +30,7 @@ from slviewer.session.store import Session
 from slviewer.simulation.plans import letter_plan
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import SimulatedRig, letter
-from slviewer.simulation.turning import turning
+from slviewer.simulation.turning import STEPS, turning
 from slviewer.target.board import Board
 from slviewer.validation.bench_live import true_calibration
 from slviewer.validation.bench_rows import median, row
@@ -139,16 +139,17 @@ def _time_captures(rig: SimulatedRig, scene: Any) -> list[Row]:
 def _time_scans(rig: SimulatedRig) -> list[Row]:
     """Rows of registering scans of an object on a turntable, with made-up noise."""
     rng, clouds = np.random.default_rng(0), {}
-    for name, scene in turning(max(SCANS)).items():
+    steps = max(STEPS, *SCANS)
+    for name, scene in turning(steps).items():
         points = Renderer(rig, scene).truth().points
         noisy = points + rng.normal(0, NOISE_MM, points.shape[:2])[..., None] * np.array([0.0, 0.0, 1.0])
         clouds[name] = Cloud(noisy, "x", "splined", np.full(points.shape[:2], NOISE_MM))
-    names, step_deg = list(clouds), 360.0 / max(SCANS)
+    names = list(clouds)
 
     def register(count: float) -> Callable[[], object]:
         """Return the registration of the first so many scans."""
         chosen = {name: clouds[name] for name in names[: int(count)]}
-        return lambda: register_all(chosen, names[0], Starts(step_deg=step_deg))
+        return lambda: register_all(chosen, names[0], Starts(step_deg=360.0 / steps))
 
     return _measure_growth("register scans of a turn", SCANS, register)
 
