@@ -121,7 +121,7 @@ def load_stereo_if_complete(store: Session) -> StereoModel | None:
     if "stereo" not in available_models(store):
         return None
     meta = store.load_result("calibration/stereo", only=())[0]
-    sized = "model" in meta or (meta["camera"] and meta["projector"]) or store.capture_names()
+    sized = "model" in meta or (meta["camera"] and meta["projector"]) or store.captures()
     return load_stereo(store) if sized else None
 
 

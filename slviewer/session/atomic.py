@@ -74,7 +74,7 @@ def replace_json(path: Path, data: Any) -> None:
 def replace_file(path: Path, data: bytes) -> None:
     """Replace a file by a new one in one step. Raises SessionError where the disk refuses; the old one then stays."""
     temporary = _staging_path(path, "tmp")
-    with _disk_errors(path.parent, len(data)):
+    with disk_errors(path.parent, len(data)):
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
             write_bytes(temporary, data)
@@ -93,7 +93,7 @@ def arriving_file(path: Path, needs_bytes: int = 0) -> Iterator[BinaryIO]:
     what stood there then stays.
     """
     temporary = _staging_path(path, "tmp")
-    with _disk_errors(path.parent, needs_bytes):
+    with disk_errors(path.parent, needs_bytes):
         path.parent.mkdir(parents=True, exist_ok=True)
         _require_space(path.parent, needs_bytes)
         try:
@@ -115,7 +115,7 @@ def staged_folder(target: Path, needs_bytes: int) -> Iterator[Path]:
     The caller then hands it to `commit`. Raises SessionError if the disk has not `needs_bytes` to spare, or fills up
     or fails while the block writes.
     """
-    with _disk_errors(target.parent, needs_bytes):
+    with disk_errors(target.parent, needs_bytes):
         target.parent.mkdir(parents=True, exist_ok=True)
         _require_space(target.parent, needs_bytes)
         folder = _staging_path(target, "tmp")
@@ -134,14 +134,14 @@ def mark_complete(folder: Path) -> Path:
     match = _LEFTOVER.fullmatch(folder.name)
     assert match is not None, folder
     complete = _staging_path(folder.with_name(match["name"]), "done")
-    with _disk_errors(folder.parent):
+    with disk_errors(folder.parent):
         os.rename(folder, complete)
     return complete
 
 
 def commit(folder: Path, target: Path, old_to: Path | None = None) -> None:
     """Rename a staged folder to `target`. An existing one is moved to `old_to`, or deleted where that is None."""
-    with _disk_errors(target.parent):
+    with disk_errors(target.parent):
         if target.exists():
             decided = _staging_path(target, "new")
             os.rename(folder, decided)
@@ -154,7 +154,7 @@ def commit(folder: Path, target: Path, old_to: Path | None = None) -> None:
 
 def move(folder: Path, target: Path) -> None:
     """Rename a folder within the session and make that durable."""
-    with _disk_errors(target.parent):
+    with disk_errors(target.parent):
         target.parent.mkdir(parents=True, exist_ok=True)
         os.rename(folder, target)
         sync_folder(target.parent)
@@ -193,7 +193,7 @@ def recover(root: Path, trash_place: Callable[[Path], Path]) -> list[Path]:
             discard(path)
             continue
         target = path.with_name(match["name"])
-        with _disk_errors(target.parent):
+        with disk_errors(target.parent):
             if target.exists() and match["state"] == "done":
                 move(path, trash_place(target))
                 continue
@@ -228,6 +228,7 @@ def _require_space(folder: Path, needs_bytes: int) -> None:
 
 def _disk_full_error(folder: Path, needs_bytes: int) -> SessionError:
     """Return the error for a full disk, with the needed and the free space in words."""
+    folder = next(each for each in (folder, *folder.parents) if each.exists())
     free = shutil.disk_usage(folder).free
     needs = f"needs {format_bytes(needs_bytes)} and {format_bytes(_SPARE_BYTES)} to spare, " if needs_bytes else ""
     return SessionError(
@@ -247,8 +248,8 @@ def format_bytes(count: int) -> str:
 
 
 @contextmanager
-def _disk_errors(folder: Path, needs_bytes: int = 0) -> Iterator[None]:
-    """Context manager: raise errors of the disk as SessionError."""
+def disk_errors(folder: Path, needs_bytes: int = 0) -> Iterator[None]:
+    """Context manager: raise errors of the disk as SessionError; ``needs_bytes`` of a save that it refuses."""
     try:
         yield
     except OSError as error:

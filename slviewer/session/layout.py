@@ -5,7 +5,7 @@ from pathlib import Path
 
 from slviewer import __version__
 from slviewer.errors import SessionError
-from slviewer.session.atomic import read_json, replace_json
+from slviewer.session.atomic import disk_errors, read_json, replace_json
 
 SCHEMA = 1
 
@@ -53,8 +53,9 @@ def new_folder(path: str | Path) -> tuple[Path, bool]:
 
 def create_layout(folder: Path) -> None:
     """Make a session of a folder from `new_folder`; it becomes one with its last file."""
-    for inner in ("captures", "results"):
-        (folder / inner).mkdir(exist_ok=True)
+    with disk_errors(folder):
+        for inner in ("captures", "results"):
+            (folder / inner).mkdir(exist_ok=True)
     created = datetime.now(UTC).isoformat(timespec="seconds")
     replace_json(folder / "session.json", {"schema": SCHEMA, "created": created, "program": f"slviewer {__version__}"})
 

@@ -31,12 +31,14 @@ class WriterLock:
             ) from error
         except OSError as error:
             raise SessionError(f"{self._folder} cannot be written ({error}): check its permissions") from error
-        self._holder.write_text(json.dumps({"pid": os.getpid(), "host": socket.gethostname()}))
+        with contextlib.suppress(OSError):  # it is only for the message to others
+            self._holder.write_text(json.dumps({"pid": os.getpid(), "host": socket.gethostname()}))
 
     def release(self) -> None:
         """Release the lock for the next writer."""
         if self._lock.is_locked:
-            self._holder.unlink(missing_ok=True)
+            with contextlib.suppress(OSError):
+                self._holder.unlink(missing_ok=True)
             self._lock.release()
 
     def release_and_remove(self) -> None:
@@ -44,8 +46,8 @@ class WriterLock:
 
         Only for a folder that is no session any more.
         """
-        self._holder.unlink(missing_ok=True)
         with contextlib.suppress(OSError):  # Windows removes no open file: an empty one stays
+            self._holder.unlink(missing_ok=True)
             Path(self._lock.lock_file).unlink()
         self._lock.release()
 

@@ -1,0 +1,274 @@
+"""Wherever the program is killed while it writes, or the disk refuses: nothing saved is lost, and work goes on."""
+
+import builtins
+import errno
+import io
+import os
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from slviewer.errors import SessionError
+from slviewer.fringe.patterns import render
+from slviewer.fringe.presets import gray
+from slviewer.pipeline.import_captures import import_captures
+from slviewer.pipeline.inspect import inspect
+from slviewer.pipeline.open_session import opened_or_made
+from slviewer.session import atomic, store
+from slviewer.session.capture import NewCapture
+from slviewer.session.lock import WriterLock
+from slviewer.session.store import Session
+
+KILL = 0
+FAULTS = {"kill": KILL, "disk full": errno.ENOSPC, "I/O error": errno.EIO, "read-only": errno.EROFS}
+
+
+class Killed(BaseException):
+    """Stands for `kill -9`: from then on the program changes nothing on disk any more."""
+
+
+class Disk:
+    """Counts the calls that change the disk, and fails at one: once (EIO), from then on, or by the program's death."""
+
+    def __init__(self, at: int | None, code: int = KILL) -> None:
+        self.calls: list[str] = []
+        self._at, self._code = at, code
+        self._dead = False
+
+    def call(self, name: str) -> None:
+        """Count a call; raises the fault where it is due."""
+        number = len(self.calls)
+        self.calls.append(name)
+        if self._dead or (self._code == KILL and number == self._at):
+            self._dead = True
+            raise Killed
+        if self._at is None or number < self._at or self._code == KILL:
+            return
+        is_growing = name in ("open", "write", "mkdir", "fsync")
+        if (self._code == errno.EIO and number > self._at) or (self._code == errno.ENOSPC and not is_growing):
+            return
+        raise OSError(self._code, os.strerror(self._code))
+
+    def write(self, file: Any, data: Any) -> int:
+        """Write to a file, half of the data where the disk fails."""
+        try:
+            self.call("write")
+        except BaseException:
+            file.write(memoryview(data).cast("B")[: memoryview(data).nbytes // 2] if not isinstance(data, str) else "")
+            raise
+        return int(file.write(data))
+
+
+class WatchedFile:
+    """A file opened for writing, whose writes are counted."""
+
+    def __init__(self, file: Any, disk: Disk) -> None:
+        self._file, self._disk = file, disk
+
+    def write(self, data: Any) -> int:
+        return self._disk.write(self._file, data)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._file, name)
+
+    def __enter__(self) -> "WatchedFile":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._file.close()
+
+
+@contextmanager
+def faulty(disk: Disk) -> Iterator[None]:
+    """Context manager: everything that changes files is counted by the disk; locks of the dead are released after."""
+    locks: list[WriterLock] = []
+    opened = builtins.open
+
+    def watched(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        def call(*arguments: Any, **options: Any) -> Any:
+            disk.call(name)
+            return function(*arguments, **options)
+
+        return call
+
+    def watched_open(path: Any, mode: str = "r", *arguments: Any, **options: Any) -> Any:
+        if not set(mode) & set("wxa+"):
+            return opened(path, mode, *arguments, **options)
+        disk.call("open")
+        return WatchedFile(opened(path, mode, *arguments, **options), disk)
+
+    class Lock(WriterLock):
+        def __init__(self, folder: Path) -> None:
+            super().__init__(folder)
+            locks.append(self)
+
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("rename", "replace", "fsync", "mkdir", "unlink", "rmdir"):
+            patch.setattr(os, name, watched(name, getattr(os, name)))
+        patch.setattr(builtins, "open", watched_open)
+        patch.setattr(io, "open", watched_open)
+        patch.setattr(store, "WriterLock", Lock)
+        try:
+            yield
+        finally:
+            for lock in locks:  # the system does so when a process ends
+                lock._lock.release(force=True)
+
+
+def points(calls: list[str], most: int) -> list[int]:
+    """Numbers of the calls to fail at: all that rename, remove or make, and some that write and sync."""
+    moves = [i for i, name in enumerate(calls) if name in ("rename", "replace", "mkdir", "unlink", "rmdir")]
+    others = np.linspace(0, len(calls) - 1, most).astype(int).tolist()
+    return sorted({*moves[:: max(1, len(moves) // most)], *moves[-3:], *others})
+
+
+def whole_captures(folder: Path) -> dict[str, str]:
+    """{name: source} of the session's captures, all of which must be what was saved; nothing else may be there."""
+    with Session.open(folder, write=True) as session:
+        assert not atomic.list_leftovers(folder)
+        captures, faults = session.read_captures()
+        assert not faults
+        for capture in captures:
+            capture.verify()
+        for name in session.result_names():
+            session.load_result(name)
+        return {capture.name: capture.meta["source"] for capture in captures}
+
+
+@pytest.fixture
+def new(sequence, noise):
+    """Makes captures to save, by their seeds."""
+    return lambda *seeds, source="": [NewCapture(f"pose_{i}", sequence, noise(i), None, source) for i in seeds]
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_several_captures_are_saved_whatever_happens(tmp_path, new, fault):
+    def attempt(folder: Path, disk: Disk) -> None:
+        with faulty(disk), opened_or_made(folder) as session:
+            session.save_captures(new(*(i for i in (1, 2, 3) if f"pose_{i}" not in session.capture_names())), "scan")
+            session.save_result("clouds/pose_1", {}, {"a": np.arange(5)})
+            session.exclude("pose_1", "why")
+
+    attempt(tmp_path / "dry", counted := Disk(None))
+    counts = set()
+    for at in points(counted.calls, 12):
+        folder = tmp_path / f"session_{at}"
+        disk = Disk(at, FAULTS[fault])
+        with pytest.raises((Killed, SessionError) if FAULTS[fault] else Killed):
+            attempt(folder, disk)
+            if FAULTS[fault]:  # what only tidies up may fail unnoticed
+                raise SessionError("nothing failed")
+        if (folder / "session.json").exists():
+            there = whole_captures(folder)
+            counts.add(len(there))
+            complete = [name for name in disk.calls[:at] if name == "rename"]
+            assert FAULTS[fault] != KILL or len(there) >= min(3, len(complete)), "a complete capture was removed"
+        attempt(folder, Disk(None))
+        assert set(whole_captures(folder)) == {"pose_1", "pose_2", "pose_3"}
+        with Session.open(folder) as session:
+            assert session.excluded() and session.state_of("clouds/pose_1") == "fresh"
+    assert {0, 3} <= counts if fault != "kill" else counts == {0, 1, 2, 3}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_replacement_is_the_old_or_the_new(tmp_path, sequence, new, fault):
+    def attempt(folder: Path, disk: Disk) -> None:
+        with faulty(disk), Session.open(folder, write=True) as session:
+            session.save_captures(new(1, source="new"), "scan", force=True)
+            session.save_result("clouds/pose_1", {"made": "new"}, {"a": np.arange(9)})
+
+    def prepare(folder: Path) -> Path:
+        with Session.create(folder) as session:
+            session.save_captures(new(1, 2, source="old"), "scan")
+            session.save_result("clouds/pose_1", {"made": "old"}, {"a": np.arange(5)})
+        return folder
+
+    attempt(prepare(tmp_path / "dry"), counted := Disk(None))
+    for at in points(counted.calls, 12):
+        folder = prepare(tmp_path / f"session_{at}")
+        with suppress(Killed, SessionError):
+            attempt(folder, Disk(at, FAULTS[fault]))
+        there = whole_captures(folder)
+        assert set(there) == {"pose_1", "pose_2"} and there["pose_2"] == "old" and there["pose_1"] in ("old", "new")
+        with Session.open(folder) as session:
+            meta, arrays = session.load_result("clouds/pose_1")
+            assert len(arrays["a"]) == {"old": 5, "new": 9}[meta["made"]]
+        attempt(folder, Disk(None))
+        assert whole_captures(folder) == {"pose_1": "new", "pose_2": "old"}
+
+
+@pytest.mark.parametrize("fault", ["kill", "disk full"])
+def test_an_import_that_was_interrupted_continues(tmp_path, fault):
+    sequence, source = gray((60, 40)), tmp_path / "source"
+    rng = np.random.default_rng(0)
+    for number in range(3):
+        (folder := source / f"capture_{number}").mkdir(parents=True)
+        for i in range(len(sequence.frames)):
+            image = np.clip(render(sequence, i) * 0.5 + 40 + rng.normal(0, 1, (40, 60)), 0, 255).round()
+            cv2.imwrite(str(folder / f"graycode_{i:02d}.png"), image.astype(np.uint8))
+
+    def attempt(folder: Path, disk: Disk) -> list[str]:
+        warnings: list[str] = []
+        with faulty(disk):
+            import_captures(source, folder, projector="60x40", warn=warnings.append)
+        return [warning for warning in warnings if warning.startswith("already")]
+
+    attempt(tmp_path / "dry", counted := Disk(None))
+    repeated = set()
+    for at in points(counted.calls, 4 if fault == "kill" else 1):
+        folder = tmp_path / f"session_{at}"
+        with pytest.raises((Killed, SessionError)):
+            attempt(folder, Disk(at, FAULTS[fault]))
+            raise SessionError("nothing failed")
+        there = whole_captures(folder) if (folder / "session.json").exists() else {}
+        skipped = attempt(folder, Disk(None))
+        assert len(skipped) == bool(there) and all(name in skipped[0] for name in there)
+        repeated.add(len(there))
+        assert len(whole_captures(folder)) == 3 and not (folder / "trash").exists()
+        assert "3 captures" in inspect(folder, check=True)
+    assert fault != "kill" or len(repeated) >= 3
+
+
+def test_a_session_that_another_writer_works_in_is_never_removed(tmp_path, sequence, frames):
+    folder = tmp_path / "session"
+    with pytest.raises(SessionError), opened_or_made(folder):
+        raise SessionError("a failure before anything is saved")
+    assert not folder.exists()
+    with pytest.raises(SessionError), opened_or_made(folder) as session:
+        (session.folder / "notes.txt").write_text("of the operator")
+        raise SessionError("a failure")
+    assert (folder / "notes.txt").exists() and Session.open(folder).capture_names() == []
+    (tmp_path / "made").mkdir()
+    with pytest.raises(SessionError), opened_or_made(tmp_path / "made"):
+        raise SessionError("a failure")
+    assert list((tmp_path / "made").iterdir()) == []
+    with pytest.raises(SessionError), opened_or_made(folder) as session:  # made by another: never removed
+        raise SessionError("a failure")
+    assert (folder / "session.json").exists()
+
+
+def test_a_failed_creation_never_costs_a_second_writer_its_work(tmp_path, sequence, frames):
+    def fail(folder: Path, moment: float) -> None:
+        with suppress(SessionError), opened_or_made(folder):
+            time.sleep(moment)
+            raise SessionError("a failure before anything is saved")
+
+    def save(folder: Path, moment: float) -> None:
+        time.sleep(moment)
+        with opened_or_made(folder) as session:
+            session.save_capture("a", "scan", sequence, frames, source="")
+
+    for race, moment in enumerate(np.linspace(0.0, 0.03, 12)):
+        folder = tmp_path / str(race)
+        with ThreadPoolExecutor(2) as pool:
+            failing, saving = pool.submit(fail, folder, 0.015), pool.submit(save, folder, moment)
+            failing.result()
+            saving.result()
+        assert whole_captures(folder) == {"a": ""}
