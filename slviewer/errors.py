@@ -3,11 +3,26 @@
 Every message states in one sentence what happened and what to do; it is shown to the operator as it is.
 """
 
+import re
+
+_CREDENTIALS = re.compile(r"(?<=://)[^\s\"']+(?=@)")  # up to the last @, as passwords hold all kinds of characters
+
+
+def hide_passwords(text: str) -> str:
+    """Return the text with user and password in addresses, such as rtsp://user:password@camera, replaced by "…".
+
+    Whatever is shown, logged or exported passes through here.
+    """
+    return _CREDENTIALS.sub("…", text)
+
 
 class SlviewerError(Exception):
-    """Base of all errors of slviewer; the message states what happened and what to do."""
+    """Base of all errors of slviewer; the message states what happened and what to do, without passwords."""
 
     exit_status = 1
+
+    def __str__(self) -> str:
+        return hide_passwords(super().__str__())
 
 
 class UsageError(SlviewerError):

@@ -192,13 +192,16 @@ class App:
         else:
             greet_viewer(client)
 
-    def _show_links(self, client: viser.ClientHandle) -> None:
-        """Show the links in the browser that requested them."""
+    def _show_links(self, client: viser.ClientHandle | None) -> None:
+        """Show the links in the browser that requested them; None: it has disconnected."""
+        if client is None:
+            return
+        number = client.client_id
 
         def replace() -> None:
             """Replace all links, and print the new ones."""
             try:
-                self.server.renew_links(client.client_id)
+                self.server.renew_links(number)
                 self.operator.notify("info", "The links were replaced: pages opened by the old ones are closed")
             except OSError as error:
                 file = self.server.serving.token_file
@@ -237,7 +240,7 @@ def run(
             try:
                 print_links(app.server)
                 if open_browser:
-                    ended.enter_context(_browser_opened(app.server))
+                    ended.enter_context(browser_opened(app.server))
                 _wait_for_stop()
             except KeyboardInterrupt:
                 print("\nslviewer has stopped; the session is saved.")
@@ -289,7 +292,7 @@ def _check_granted(operator: Operator, granted: bool) -> None:
 
 
 @contextlib.contextmanager
-def _browser_opened(server: SafeServer) -> Iterator[None]:
+def browser_opened(server: SafeServer) -> Iterator[None]:
     """Open the wizard in the default browser without waiting; nothing happens where there is none.
 
     The command line of a browser can be read by every user of the machine: it is given a file that this user alone can

@@ -19,10 +19,12 @@ def show_links(client: viser.ClientHandle, server: SafeServer, replace: Callable
         gui = client.gui
         gui.add_html("".join(_link_html(what, link) for what, link in rows))
         gui.add_html(
-            paragraph(
-                Html(
-                    "<b>New links</b> closes every page that was opened by the present ones, for watching and of the "
-                    "projector too. This page continues."
+            str(
+                paragraph(
+                    Html(
+                        "<b>New links</b> closes every page that was opened by the present ones, for watching and of "
+                        "the projector too. This page continues."
+                    )
                 )
             )
         )

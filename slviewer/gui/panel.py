@@ -46,7 +46,7 @@ class PanelContext:
     executor: Executor
     viewers: Callable[[Callable[[], None]], Viewers]
     projector_page: Callable[[], PageState | None] = lambda: None
-    show_links: Callable[[viser.ClientHandle], None] = lambda _: None
+    show_links: Callable[[viser.ClientHandle | None], None] = lambda _: None
 
     @property
     def session(self) -> Session:

@@ -12,6 +12,7 @@ import numpy as np
 import viser
 
 from slviewer.calibration.next_pose import nominal_lens
+from slviewer.errors import hide_passwords
 from slviewer.evaluation.render import format_count
 from slviewer.gui.inputs import change
 from slviewer.gui.panel import PanelContext, StepPanel
@@ -290,7 +291,7 @@ def autopilot_step(snapshot: Snapshot) -> str:
 def notify(client: viser.ClientHandle, level: Level, text: str) -> None:
     """Show a notification in one browser."""
     title, colour, seconds, _ = _NOTICES[level]
-    client.add_notification(title, text, color=colour, auto_close_seconds=seconds)
+    client.add_notification(title, hide_passwords(text), color=colour, auto_close_seconds=seconds)
 
 
 def greet_viewer(client: viser.ClientHandle) -> None:

@@ -16,6 +16,7 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
+from slviewer.errors import hide_passwords
 from slviewer.report.page import Cell, Mark, Table
 from slviewer.server.text import escape
 
@@ -55,8 +56,11 @@ class Html(str):
 
 
 def to_html(text: object) -> Html:
-    """Escape any text as HTML, without line breaks between a figure and its unit; HTML stays as it is."""
-    return text if isinstance(text, Html) else Html(_UNIT.sub("&#160;", escape(str(text))))
+    """Escape any text as HTML, without line breaks between a figure and its unit; HTML stays as it is.
+
+    Passwords in addresses are hidden: whoever watches reads this too.
+    """
+    return text if isinstance(text, Html) else Html(_UNIT.sub("&#160;", escape(hide_passwords(str(text)))))
 
 
 def coloured(text: object, tone: Tone, *, bold: bool = False) -> Html:

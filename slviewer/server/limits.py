@@ -17,7 +17,7 @@ STRANGERS, STRANGERS_PER_ADDRESS = 128, 64
 """Connections without a valid cookie, in all and from one address; beyond, the oldest one is closed."""
 CONNECTIONS: dict[Role, int] = {"operate": 64, "watch": 64, "project": 16}
 """Connections with the cookie of a role; beyond, another one is refused."""
-ACCEPTED_AT_ONCE = 8
+ACCEPTED_AT_ONCE = 16
 """Connections accepted before those that are open are served again."""
 _CLOSING = 32
 _LOG_SECONDS = 60.0

@@ -179,6 +179,7 @@ def serve(serving: Serving, *, label: str | None = None, upload_limit: int = 256
                 create_connection=Connection,
                 max_size=MESSAGE_LIMIT,
                 server_header=None,
+                backlog=1024,  # of a crowd: a browser whose request does not fit in tries again after a second
                 open_timeout=None,  # Connection limits the request alone
                 logger=quiet_logger(),
             )

@@ -8,7 +8,6 @@ import json
 import logging
 import os
 import platform
-import re
 import sys
 import zipfile
 from collections import deque
@@ -19,6 +18,7 @@ from typing import Any
 import cv2
 
 from slviewer import __version__
+from slviewer.errors import hide_passwords
 from slviewer.session.atomic import to_json
 from slviewer.session.store import Session
 from slviewer.wizard.export_files import staged_export
@@ -26,7 +26,6 @@ from slviewer.wizard.jobs import Reporter
 from slviewer.wizard.snapshot import PreviewView, Snapshot
 
 LINES = 4000
-_PASSWORD = re.compile(r"(?<=://)[^/\s\"'@]+(?=@)")
 PACKAGES = ("numpy", "opencv-python-headless", "numba", "scipy", "zarr", "open3d-cpu", "open3d", "viser", "trimesh")
 
 
@@ -44,7 +43,7 @@ class LogKeeper(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         """Store one record."""
-        self.lines.append(self.format(record))
+        self.lines.append(hide_passwords(self.format(record)))
 
     def close(self) -> None:
         """Stop logging here."""
@@ -60,15 +59,15 @@ def write_bundle(
     with staged_export(session, name, report) as path, zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as bundle:
         report(0.1, "versions and settings")
         bundle.writestr("versions.json", to_json(_collect_versions()))
-        bundle.writestr("state.json", _mask_passwords(to_json(_summarise_state(snapshot)).decode()))
-        bundle.writestr("log.txt", _mask_passwords("\n".join(log.lines) + "\n"))
+        bundle.writestr("state.json", hide_passwords(to_json(_summarise_state(snapshot)).decode()))
+        bundle.writestr("log.txt", "\n".join(log.lines) + "\n")
         for file in ("session.json", "decisions.json"):
             if (session.folder / file).is_file():
-                bundle.writestr(f"session/{file}", _mask_passwords((session.folder / file).read_text("utf-8")))
+                bundle.writestr(f"session/{file}", hide_passwords((session.folder / file).read_text("utf-8")))
         report(0.4, "captures and results")
         for capture in session.captures():
             described = {key: value for key, value in capture.meta.items() if key != "sequence"}
-            bundle.writestr(f"session/captures/{capture.name}.json", to_json(described))
+            bundle.writestr(f"session/captures/{capture.name}.json", hide_passwords(to_json(described).decode()))
         for result in session.result_names():
             bundle.writestr(f"session/results/{result}.json", to_json(session.load_result(result, only=())[0]))
         report(0.8, "previews")
@@ -81,11 +80,6 @@ def write_bundle(
             bundle.writestr("previews/now.jpg", bytes(cv2.imencode(".jpg", preview.image)[1]))
     report(1.0, "collected")
     return name
-
-
-def _mask_passwords(text: str) -> str:
-    """Return the text with the credentials in URLs replaced by "…"."""
-    return _PASSWORD.sub("…", text)
 
 
 def _collect_versions() -> dict[str, Any]:

@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Callable
 from datetime import datetime
 
-from slviewer.errors import SlviewerError
+from slviewer.errors import SlviewerError, hide_passwords
 from slviewer.wizard.snapshot import Level, Notice
 
 log = logging.getLogger("slviewer.wizard")
@@ -24,7 +24,8 @@ class Notices:
         self._count = 0
 
     def add(self, level: Level, text: str) -> None:
-        """Add a notice and log it."""
+        """Add a notice and log it, without passwords."""
+        text = hide_passwords(text)
         log.log({"warning": logging.WARNING, "error": logging.ERROR}.get(level, logging.INFO), "%s", text)
         with self._lock:
             self._count += 1

@@ -1,13 +1,16 @@
 """The frame of the page, as someone sees it who opens it: the steps, one pose, a reload, a guest, a failure."""
 
+import time
+import webbrowser
 from pathlib import Path
 
 import pytest
+import zstandard
 from playwright.sync_api import Browser, expect
-from wizard_page import SIZE, Opened, button, field
+from wizard_page import SIZE, Opened, button, choose, field
 
 from slviewer.errors import UsageError
-from slviewer.gui.app import App, rig_choice
+from slviewer.gui.app import App, browser_opened, rig_choice
 from slviewer.wizard.operator import Operator
 
 STEPS = ("Rig", "Target", "Poses", "Calibrate", "Verify", "Scan", "Merge", "Measure", "Export")
@@ -46,6 +49,82 @@ def test_a_guest_sees_the_same_step_and_changes_nothing(opened: Opened, app: App
     guest.wait_for_timeout(500)
     assert app.shell.current == "target"
     guest.context.close()
+
+
+def test_new_links_end_what_the_old_ones_opened(opened: Opened, app: App, browser: Browser) -> None:
+    page, old = opened.page, app.server.link("watch")
+    guest = browser.new_context(viewport=SIZE).new_page()
+    guest.goto(old)
+    expect(guest.get_by_text("View only")).to_be_visible()
+    button(page, "Links").click()
+    expect(page.get_by_text(old)).to_be_visible()
+    assert old not in guest.content()
+    before = page.url
+    button(page, "New links").click()
+    page.wait_for_url(lambda url: "/operate-" in url and url != before)
+    expect(button(page, "1. Rig")).to_be_visible()
+    assert app.server.link("watch") != old
+    guest.reload()
+    expect(guest.get_by_text("no longer valid")).to_be_visible()
+    guest.goto(old)
+    expect(guest.get_by_text("no longer, valid")).to_be_visible()
+    guest.context.close()
+
+
+def test_the_password_of_a_camera_reaches_operators_alone(
+    opened: Opened, app: App, browser: Browser, caplog: pytest.LogCaptureFixture
+) -> None:
+    page = opened.page
+    received: list[bytes | str] = []
+    guest = browser.new_context(viewport=SIZE).new_page()
+    guest.on("websocket", lambda socket: socket.on("framereceived", lambda frame: received.append(frame)))
+    guest.goto(app.server.link("watch"))
+    expect(guest.get_by_text("View only")).to_be_visible()
+    button(page, "1. Rig").click()
+    choose(page, "Rig", "Custom …")
+    field(page, "Camera ID").fill("rtsp://admin:hunter2@127.0.0.1:9/stream")
+    page.wait_for_timeout(500)
+    button(page, "Use these devices").click()
+    expect(page.get_by_text("127.0.0.1/stream").first).to_be_visible()
+    page.reload()
+    expect(field(page, "Camera ID")).to_have_value("rtsp://admin:hunter2@127.0.0.1:9/stream")
+    guest.reload()
+    expect(guest.get_by_text("127.0.0.1/stream").first).to_be_visible()
+    shown = "".join(field(guest, "Camera ID").input_value() + guest.content())
+    assert "hunter2" not in shown + caplog.text + "".join(unpacked(frame) for frame in received)
+    guest.context.close()
+
+
+def unpacked(frame: bytes | str) -> str:
+    """The text of a frame that viser's server sent."""
+    assert isinstance(frame, bytes)
+    size = int.from_bytes(frame[8:16], "little")
+    inner = zstandard.ZstdDecompressor().decompress(frame[16 : 16 + size], int.from_bytes(frame[:8], "little"))
+    return inner.decode("latin-1")
+
+
+def test_the_browser_is_handed_a_one_time_link_in_a_private_file(
+    app: App, browser: Browser, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    given: list[str] = []
+    monkeypatch.setattr(Path, "home", lambda: tmp_path)
+    monkeypatch.setattr(webbrowser, "get", lambda: None)
+    monkeypatch.setattr(webbrowser, "open", given.append)
+    page = browser.new_context(viewport=SIZE).new_page()
+    with browser_opened(app.server):
+        while not given:
+            time.sleep(0.01)
+        (address,) = given
+        file = Path(address.removeprefix("file://"))
+        assert file.stat().st_mode & 0o777 == 0o600 and file.parent.stat().st_mode & 0o777 == 0o700
+        assert not [grant for grant in app.server.access.grants.values() if grant.token in address + file.read_text()]
+        page.goto(address)
+        page.wait_for_url("**/operate-*/")
+        end = time.monotonic() + 5
+        while file.exists() and time.monotonic() < end:
+            page.wait_for_timeout(50)
+        assert not file.exists()
+    page.context.close()
 
 
 def test_what_cannot_be_done_is_said_in_words(opened: Opened, tmp_path: Path) -> None:
