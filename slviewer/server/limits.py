@@ -13,12 +13,13 @@ from slviewer.server.access import Refusal, Role
 
 logger = logging.getLogger("slviewer.server")
 
-STRANGERS, STRANGERS_PER_ADDRESS = 128, 64
+STRANGERS, STRANGERS_PER_ADDRESS = 256, 128
 """Connections without a valid cookie, in all and from one address; beyond, the oldest one is closed."""
 CONNECTIONS: dict[Role, int] = {"operate": 64, "watch": 64, "project": 16}
 """Connections with the cookie of a role; beyond, another one is refused."""
-ACCEPTED_AT_ONCE = 16
-"""Connections accepted before those that are open are served again."""
+ACCEPTED_AT_ONCE = 4
+"""Connections accepted before those that are open are served again: about eight turns of the event loop serve a
+request, and its connection must not give way to others before, of the crowd's address though it may be."""
 _CLOSING = 32
 _LOG_SECONDS = 60.0
 

@@ -45,7 +45,7 @@ def test_a_crowd_of_strangers_keeps_nobody_out(server, operator, crowd, caplog, 
     client = operator.client()
     slider = server.viser.gui.add_slider("gain", 0, 10, 1, 5)
     with caplog.at_level(logging.INFO):
-        opened = crowd(6 * STRANGERS_PER_ADDRESS, said)
+        opened = crowd(3 * STRANGERS_PER_ADDRESS, said)
         assert until(lambda: sum(map(is_open, opened)) <= STRANGERS_PER_ADDRESS)
         assert operator.get().status == 200 and Browser(server, None).get("/").status == 200
         client.set(slider, 7)
