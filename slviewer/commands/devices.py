@@ -64,13 +64,19 @@ def run_preflight(check_rig: Callable[..., Any], arguments: dict[str, Any]) -> N
 @contextmanager
 def _serve_projector_page(port: int) -> Iterator["SetUp"]:
     """Yield the function that sets up rigs, which serves the projector page where needed until the block ends."""
+    from slviewer.devices.channel import Channel
     from slviewer.pipeline.rig_choice import Board, Choice, RigSetup, needs_page, set_up
 
     with ExitStack() as ended:
 
         def make(choice: Choice, board: Board | None) -> RigSetup:
             """Set up a rig, with a channel to the projector page where it needs one."""
-            return set_up(choice, board, channel=_connect_page(port, ended) if needs_page(choice) else None)
+            if not needs_page(choice):
+                return set_up(choice, board)
+            # with an assumed size and without a page, so that what is impossible is refused before somebody walks there
+            projector = {"size": [912, 1140], **choice["projector"]}
+            set_up({**choice, "projector": projector}, board, channel=Channel())
+            return set_up(choice, board, channel=_connect_page(port, ended))
 
         yield make
 

@@ -26,9 +26,9 @@ class CameraSettings:
     gain: float | None = None
 
     def __post_init__(self) -> None:
-        if self.exposure_ms is not None and not 0 < self.exposure_ms < float("inf"):
+        if self.exposure_ms is not None and not 0 < self.exposure_ms <= 600_000:
             raise InputError(f"an exposure of {self.exposure_ms:g} ms is impossible: give a time above 0")
-        if self.gain is not None and not 0 < self.gain < float("inf"):
+        if self.gain is not None and not 0 < self.gain <= 1e6:
             raise InputError(f"a gain of {self.gain:g} is impossible: give a factor above 0, 1 for none")
 
 

@@ -6,6 +6,8 @@ from dataclasses import dataclass, replace
 from math import isfinite
 from typing import Any, Generic, Literal, NamedTuple, TypeVar, get_args
 
+from msgspec import ValidationError, convert
+
 from slviewer.errors import InputError
 
 Axis = Literal["x", "y"]
@@ -23,6 +25,9 @@ _FIELDS = {
 }
 """Fields that a frame of each kind must define."""
 
+MAX_STEPS = 1000
+MAX_EXTENT = 1 << 16
+"""Columns and rows of a projector, px."""
 SEQUENCE_KEYS = (
     "projector", "phase_sign", "phase_offset", "gray_origin", "gray_cell_px", "relative", "levels", "frame",
 )  # fmt: skip
@@ -63,11 +68,11 @@ class Frame:
         if "axis" in _FIELDS[self.kind] and self.axis is None:
             raise InputError(f"a {self.kind} frame has no axis: say x (varies along columns) or y (along rows)")
         if self.kind == "phase":
-            if self.steps < 3:
-                raise InputError(f"{self.steps} phase steps cannot be decoded: use 3 or more")
+            if not 3 <= self.steps <= MAX_STEPS:
+                raise InputError(f"{self.steps} phase steps cannot be decoded: use 3 to {MAX_STEPS}")
             if not 0 <= self.step < self.steps:
                 raise InputError(f"phase step {self.step} of {self.steps} does not exist: count from 0")
-            if not self.period_px >= 2:
+            if not 2 <= self.period_px <= MAX_EXTENT:
                 raise InputError(f"a fringe period of {self.period_px:g} px cannot be shown: use 2 px or more")
         if self.kind in ("gray", "inverse") and not 0 <= self.bit < 31:
             raise InputError(f"Gray bit {self.bit} does not exist: count from 0, the most significant")
@@ -90,15 +95,17 @@ class Frame:
         if "kind" not in data:
             raise InputError('a frame does not say its kind: add kind = "phase", "gray", ...')
         try:
+            kind, axis = convert(data["kind"], str), convert(data.get("axis"), str | None)
             numbers: dict[str, Any] = {
-                name: int(data[name]) for name in ("step", "steps", "bit", "bits") if name in data
+                name: convert(data[name], int, strict=False)
+                for name in ("step", "steps", "bit", "bits")
+                if name in data
             }
-            numbers["period_px"] = float(data.get("period_px", 0.0))
-        except (TypeError, ValueError) as error:
+            numbers["period_px"] = convert(data.get("period_px", 0.0), float, strict=False)
+        except ValidationError as error:
             raise InputError(f"a {data['kind']} frame has an entry that is no number ({error}): correct it") from error
-        kind = data["kind"]
         values = {name: value for name, value in numbers.items() if name in _FIELDS.get(kind, ())}
-        return cls(kind=kind, axis=data.get("axis"), **values)
+        return cls(kind=kind, axis=axis, **values)  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True)
@@ -310,10 +317,10 @@ def parse_size(text: Any) -> tuple[int, int]:
     """Parse (width, height) from "912x1140" or [912, 1140]. Raises InputError."""
     parts = text.lower().split("x") if isinstance(text, str) else text
     try:
-        width, height = (int(part) for part in parts)
-    except (TypeError, ValueError) as error:
+        width, height = convert(parts, tuple[int, int], strict=False)
+    except ValidationError as error:
         raise InputError(f"'{text}' is no projector size: write width and height like 912x1140") from error
-    if width < 1 or height < 1:
+    if not (1 <= width <= MAX_EXTENT and 1 <= height <= MAX_EXTENT):
         raise InputError(f"'{text}' is no projector size: write width and height like 912x1140")
     return width, height
 
@@ -340,9 +347,10 @@ def _read_values(data: Mapping[str, Any], name: str, default: Any, kind: type) -
         raise InputError(f"{name} has the unknown entry '{unknown[0]}': use x and y")
     try:
         if isinstance(given, Mapping):
-            return PerAxis(*(kind(given[axis]) if axis in given else default for axis in get_args(Axis)))
-        return given if given is default else kind(given)
-    except (TypeError, ValueError) as error:
+            pair = (convert(given[axis], kind, strict=False) if axis in given else default for axis in get_args(Axis))
+            return PerAxis(*pair)
+        return given if given is default else convert(given, kind, strict=False)
+    except ValidationError as error:
         raise InputError(f"{name} must be a number, or {{x = ..., y = ...}} ({error}): correct it") from error
 
 

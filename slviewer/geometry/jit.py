@@ -50,13 +50,12 @@ def kernel(*, parallel: bool = False, fastmath: bool = False) -> Callable[[Calla
 
 def _compile_once(compile_here: Callable[[Any], Any], path: Path) -> Callable[[Any], Any]:
     """Wrap a dispatcher's ``compile(signature)``: what one process compiles, others wait for, and load."""
-    lock = FileLock(path, thread_local=False)
 
     def compile_or_load(signature: Any) -> Any:
         """Compile while this process holds the kernel's lock; without it where the disk has no locks."""
         with global_compiler_lock, ExitStack() as stack:  # in the order in which numba takes its own for callees
             with suppress(OSError, NotImplementedError):
-                stack.enter_context(lock)
+                stack.enter_context(FileLock(path, thread_local=False))  # of this process, were it forked
             return compile_here(signature)
 
     return compile_or_load

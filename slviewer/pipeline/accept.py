@@ -1,6 +1,5 @@
 """The acceptance test: artefacts with certificates against the session's calibration."""
 
-import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -23,6 +22,7 @@ from slviewer.pipeline.models import ModelName, best_model, check_accepted, load
 from slviewer.pipeline.open_session import SessionLike, match_names, next_number, opened
 from slviewer.pipeline.reconstruct import segment_board
 from slviewer.pipeline.scale import record_scale, scale_factor
+from slviewer.session.reading import read_toml
 from slviewer.session.store import Session
 
 
@@ -136,10 +136,7 @@ def accept(
 
 def read_artefact(path: Path | str) -> Artefact:
     """The artefact that a TOML file describes."""
-    try:
-        given = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} is no TOML file ({error}): see assets/artefacts for examples") from error
+    given = read_toml(path)
     try:
         return Artefact.from_dict(given)
     except InputError as error:

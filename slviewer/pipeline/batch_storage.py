@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from slviewer.errors import InputError, SessionError
+from slviewer.session.reading import expand_user
 from slviewer.session.store import is_session
 
 
@@ -21,7 +22,7 @@ def is_remote(address: str) -> bool:
 def absolute_address(session: Path | str) -> str:
     """The address of a session as every worker understands it: folders become absolute."""
     address = os.fspath(session)
-    return address.rstrip("/") if is_remote(address) else str(Path(address).expanduser().absolute())
+    return address.rstrip("/") if is_remote(address) else str(expand_user(address).absolute())
 
 
 @contextmanager

@@ -70,9 +70,13 @@ def capture(
             raise InputError(f"there is a capture {name!r} already: choose another name, or replace it with --force")
         choice = rig if isinstance(rig, Mapping) else load_rig(rig, store)
         target = target or (Board.parse(known) if (known := store.decision("target")) else None)
+        camera_settings(choice, exposure_ms, gain)  # refused before anything is opened
+        patterns = patterns or str(store.decision("patterns") or DEFAULT_PATTERNS)
+        if choice.get("driver") != "replay":
+            check_patterns(patterns)
         progress(0.0, "opening the devices")
         bench = set_up(choice, target)
-        sequence = choose_sequence(bench, patterns or str(store.decision("patterns") or DEFAULT_PATTERNS))
+        sequence = choose_sequence(bench, patterns)
         _check_disk_space(store, bench, len(sequence.frames) * max(1, len(exposures)))
         with bench.rig.opened() as devices:
             set_camera(devices, choice, exposure_ms, gain, warn)
@@ -99,19 +103,30 @@ def capture(
 
 def set_camera(rig: Rig, choice: Mapping[str, Any], exposure_ms: float | None, gain: float | None, warn: Warn) -> None:
     """Set the open rig's camera to the requested values, else to those of its choice; warns of those refused."""
-    wanted = CameraSettings(exposure_ms or choice.get("exposure_ms"), gain or choice.get("gain"))
+    wanted = camera_settings(choice, exposure_ms, gain)
     if wanted != CameraSettings():
         rig.camera.apply(wanted)
     for note in getattr(rig.camera, "notes", ()):
         warn(note)
 
 
+def camera_settings(choice: Mapping[str, Any], exposure_ms: float | None, gain: float | None) -> CameraSettings:
+    """Return the requested settings, else those of the choice. Raises InputError for impossible ones."""
+    exposure_ms = choice.get("exposure_ms") if exposure_ms is None else exposure_ms
+    return CameraSettings(exposure_ms, choice.get("gain") if gain is None else gain)
+
+
+def check_patterns(patterns: str) -> None:
+    """Raise InputError unless a pattern sequence has this name."""
+    if patterns not in PRESETS:
+        raise InputError(f"no pattern sequence is called {patterns!r}: use {', '.join(PRESETS)}")
+
+
 def choose_sequence(bench: RigSetup, patterns: str) -> PatternSequence:
     """Return the sequence to project: the one of that name for the rig's projector, or the rig's only one."""
     if bench.reel is not None:
         return bench.reel.sequence
-    if patterns not in PRESETS:
-        raise InputError(f"no pattern sequence is called {patterns!r}: use {', '.join(PRESETS)}")
+    check_patterns(patterns)
     return PRESETS[patterns](bench.rig.projector.size)
 
 

@@ -18,6 +18,7 @@ from slviewer.pipeline.open_session import SessionLike, opened
 from slviewer.pipeline.report import report
 from slviewer.session.atomic import format_bytes
 from slviewer.session.mesh_files import IN_WORDS, MESH_FORMATS, POINT_FORMATS, estimated_bytes, write_shape
+from slviewer.session.reading import expand_user
 from slviewer.session.store import Session
 from slviewer.surface.meshing import MeshingPlan
 
@@ -202,7 +203,7 @@ def _resolve_name(store: Session, what: What, name: str) -> str:
 
 def _output_path(store: Session, what: What, name: str, out: Path | str | None, chosen: str) -> Path:
     """Return the path of the file to write, with a suffix that fits the format."""
-    given = None if out is None else Path(out).expanduser()
+    given = None if out is None else expand_user(out)
     if given is None or given.is_dir():
         return (given or store.exports) / default_file_name(what, name, chosen or FORMATS[what][0])
     suffix = given.suffix.lower().removeprefix(".")

@@ -26,6 +26,7 @@ from slviewer.session.importers.guessed_description import GuessedDescription
 from slviewer.session.importers.images import Channel
 from slviewer.session.importers.imported import ImportableRecording, Imports, Skipped, none_usable
 from slviewer.session.importers.layouts import LAYOUTS, detect_layout, find_description
+from slviewer.session.reading import expand_user
 from slviewer.session.store import Session, is_session
 
 Role = Literal["calibration", "scan"]
@@ -118,7 +119,7 @@ def find_captures(
     **options: Any,
 ) -> Imports:
     """The captures of a folder, not yet read; ``session`` knows the projector's size where it is not stated."""
-    source = Path(source).expanduser()
+    source = expand_user(source)
     if layout == "detect":
         layout = "frames" if sequence is not None else detect_layout(source)
     if layout not in LAYOUTS:
@@ -232,7 +233,7 @@ def _save_captures(
 
 def _known_projector_size(session: SessionLike) -> tuple[int, int] | None:
     """The projector's size by the session's captures, else by its imported calibration; None where both are missing."""
-    if not isinstance(session, Session) and not is_session(Path(session).expanduser()):
+    if not isinstance(session, Session) and not is_session(expand_user(session)):
         return None
     with opened(session) as store:
         sizes = {capture.sequence.projector_size for capture in store.captures()} - {None}

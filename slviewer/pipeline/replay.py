@@ -13,6 +13,7 @@ from slviewer.fringe.sequence import PatternSequence
 from slviewer.pipeline.feedback import ignore_warnings
 from slviewer.pipeline.import_captures import check_imported_capture, find_captures
 from slviewer.session.importers.imported import ImportableRecording
+from slviewer.session.reading import expand_user
 from slviewer.session.store import Session, is_session
 
 Shot = tuple[np.ndarray, PatternSequence]
@@ -58,7 +59,7 @@ def reel(
     layout frames, `projector` its size, such as "912x1140", where it is not the layout's own. Raises InputError,
     SessionError.
     """
-    folder = Path(source).expanduser()
+    folder = expand_user(source)
     if layout == "session" or (layout is None and is_session(folder)):
         shots = _read_recorded(folder)
     else:

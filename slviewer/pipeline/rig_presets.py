@@ -5,15 +5,19 @@ before a device is touched, so that a mistyped option is named and not ignored.
 """
 
 import inspect
-import tomllib
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from math import isfinite
 from pathlib import Path
 from typing import Any
+
+import msgspec
 
 from slviewer.devices.drivers import Driver, driver, drivers
 from slviewer.errors import InputError
 from slviewer.pipeline.rig_choice import COMMON_KEYS, Choice, rig_factory
+from slviewer.session.reading import expand_user, read_toml
 from slviewer.session.store import Session
 from slviewer.session.toml import to_toml
 from slviewer.simulation.assets import asset_folder
@@ -21,7 +25,7 @@ from slviewer.simulation.assets import asset_folder
 RigLike = Mapping[str, Any] | Path | str
 """A choice of devices, a TOML file that holds one, or the name of a preset."""
 FOLDER = "rigs"
-_NUMBERS = ("settle_ms", "focal_px", "exposure_ms", "gain")
+_LARGEST = {"settle_ms": 60_000, "focal_px": 1e6, "exposure_ms": 600_000, "gain": 1e6}
 
 
 @dataclass(frozen=True)
@@ -58,7 +62,7 @@ def load_rig(path_or_name: Path | str, session: Session | None = None) -> dict[s
     Raises InputError for a file or a name that does not exist, an unknown key or driver, DeviceError where a package is
     missing.
     """
-    path = Path(path_or_name).expanduser()
+    path = expand_user(path_or_name)
     if path.suffix.lower() == ".toml" or path.is_file():
         if not path.is_file():
             raise InputError(
@@ -83,15 +87,15 @@ def save_rig(session: Session, name: str, choice: Choice, what: str = "") -> Pre
 
 def check_choice(choice: Choice, where: str) -> None:
     """Raise InputError, which names the place `where`, unless `choice` names devices and only options they know."""
-    for key in _NUMBERS:
+    for key, largest in _LARGEST.items():
         value = choice.get(key, 1)
         if (
             isinstance(value, bool)
             or not isinstance(value, int | float)
-            or not 0 <= value < float("inf")
-            or (not value and key != _NUMBERS[0])
+            or not 0 <= value <= largest
+            or (not value and key != "settle_ms")
         ):
-            raise InputError(f"{where}: {key} = {value!r} is no number above 0: correct it")
+            raise InputError(f"{where}: {key} = {value!r} is no number above 0, up to {largest:g}: correct it")
     if not isinstance(choice.get("name", ""), str):
         raise InputError(f"{where}: name = {choice['name']!r} is no text: correct it")
     if "driver" in choice:
@@ -113,10 +117,7 @@ def check_choice(choice: Choice, where: str) -> None:
 
 def _read_preset(name: str, path: Path) -> Preset:
     """Read and check a preset's TOML; InputError where it is invalid."""
-    try:
-        choice = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise InputError(f"{path} cannot be read as TOML ({error}): correct it") from error
+    choice = read_toml(path)
     what = choice.pop("what", "")
     if not isinstance(what, str):
         raise InputError(f"{path}: what = {what!r} is no text: correct it")
@@ -142,7 +143,7 @@ def _check_options(name: str, part: str, options: Mapping[str, Any], where: str)
     make = _driver_factory(drivers()[name], part)
     if make is None:
         raise InputError(f"{where}: the driver {name} offers no {part}: choose another")
-    parameters = inspect.signature(make).parameters.values()
+    parameters = inspect.signature(make, eval_str=True).parameters.values()
     if any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters):
         return
     # the program supplies these; they are no entries of a file
@@ -156,6 +157,22 @@ def _check_options(name: str, part: str, options: Mapping[str, Any], where: str)
     required = [p.name for p in known if p.default is p.empty and p.name not in options]
     if required:
         raise InputError(f"{where}: the driver {name} needs {required[0]}: add it")
+    for parameter in known:
+        _check_type(parameter, options, where)
+
+
+def _check_type(parameter: inspect.Parameter, options: Mapping[str, Any], where: str) -> None:
+    """Raise InputError where an option is not of the type of the driver's parameter, or no number that is finite."""
+    value = options.get(parameter.name, parameter.default)
+    if isinstance(value, float) and not isfinite(value):
+        raise InputError(f"{where}: {parameter.name} = {value!r} is no number: correct it")
+    if parameter.name not in options or parameter.annotation is parameter.empty:
+        return
+    try:
+        with suppress(TypeError):  # a path, which the driver checks itself
+            msgspec.convert(value, parameter.annotation)
+    except msgspec.ValidationError as error:
+        raise InputError(f"{where}: {parameter.name} = {value!r} is of the wrong type ({error}): correct it") from error
 
 
 def _driver_factory(driver: Driver, part: str) -> Any:

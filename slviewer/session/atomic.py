@@ -18,7 +18,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from slviewer.errors import DamagedError, SessionError
+from slviewer.errors import SessionError
 from slviewer.records import to_plain
 
 _LEFTOVER = re.compile(r"\.(?P<name>.+)\.(?P<state>tmp|done|new)-\d+-[0-9a-f]+")
@@ -51,19 +51,6 @@ def write_json(path: Path, data: Any) -> None:
 def to_json(data: Any) -> bytes:
     """Encode as readable UTF-8 JSON; NaN stays NaN, as Python's own reader understands it."""
     return (json.dumps(data, indent=2, ensure_ascii=False, default=to_plain) + "\n").encode()
-
-
-def read_json(path: Path) -> dict[str, Any]:
-    """The object in a JSON file; DamagedError where the file is damaged or holds no object."""
-    try:
-        data = json.loads(path.read_bytes())
-    except (ValueError, OSError) as error:
-        raise DamagedError(
-            f"{path} cannot be read ({error}): restore it from a copy, or move its folder away"
-        ) from error
-    if not isinstance(data, dict):
-        raise DamagedError(f"{path} holds no JSON object: restore it from a copy, or move its folder away")
-    return data
 
 
 def replace_json(path: Path, data: Any) -> None:

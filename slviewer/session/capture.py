@@ -7,14 +7,17 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
+import msgspec
 import numpy as np
 
 from slviewer.errors import DamagedError, InputError, SessionError
 from slviewer.fringe.hdr import choose_exposure, chosen, merge_exposures, peaks, pick
 from slviewer.fringe.sequence import PatternSequence
-from slviewer.session.atomic import read_json, to_json, write_bytes, write_json
+from slviewer.records import from_plain
+from slviewer.session.atomic import to_json, write_bytes, write_json
+from slviewer.session.reading import decoding, read_json
 from slviewer.session.stack import (
     check_frames,
     describe_stack,
@@ -115,6 +118,31 @@ class Capture:
         return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
+_Extent = Annotated[int, msgspec.Meta(ge=1, le=1 << 16)]
+
+
+@dataclass(frozen=True)
+class _Camera:
+    """The entry `camera` of `capture.json`."""
+
+    size: tuple[_Extent, _Extent]
+
+
+@dataclass(frozen=True)
+class _Description:
+    """The entries of `capture.json` that are read, with their types and ranges."""
+
+    role: Role
+    hash: str
+    camera: _Camera
+    sequence: dict[str, Any]
+    source: str = ""
+    board: str | None = None
+    texture: bool = False
+    exposures_ms: list[Annotated[float, msgspec.Meta(gt=0, lt=1e9)]] = field(default_factory=list)
+    settings: dict[str, Any] = field(default_factory=dict)
+
+
 @dataclass(frozen=True)
 class NewCapture:
     """A capture in memory, to be saved: ``frames`` (n, h, w) uint8 or uint16 in the order of ``sequence``, or
@@ -192,14 +220,10 @@ def write_capture(folder: Path, capture: NewCapture, role: Role, board: str | No
 def read_capture(folder: Path) -> Capture:
     """The capture in a folder; its frames stay there. SessionError where its description is damaged."""
     meta = read_json(folder / "capture.json")
-    try:
-        width, height = meta["camera"]["size"]
-        role, sequence, content_hash = meta["role"], _read_sequence(json.dumps(meta["sequence"])), str(meta["hash"])
-    except (KeyError, TypeError, ValueError, InputError) as error:
-        raise DamagedError(
-            f"{folder / 'capture.json'} is damaged ({error!r}): move the folder away and import it again"
-        ) from error
-    return Capture(folder.name, role, sequence, (int(width), int(height)), content_hash, folder, meta)
+    with decoding(folder / "capture.json"):
+        described = from_plain(meta, _Description)
+        sequence = _read_sequence(json.dumps(described.sequence))
+    return Capture(folder.name, described.role, sequence, described.camera.size, described.hash, folder, meta)
 
 
 def compare_captures(folder: Path, new: NewCapture, role: Role) -> Comparison:

@@ -11,6 +11,7 @@ from slviewer.errors import InputError
 from slviewer.fringe.patterns import render
 from slviewer.fringe.sequence import Frame, PatternSequence
 from slviewer.session.atomic import commit, replace_file, staged_folder, to_json, write_bytes
+from slviewer.session.reading import expand_user
 from slviewer.session.toml import describe_sequence
 
 
@@ -38,7 +39,7 @@ def write_pattern_folder(folder: Path, sequence: PatternSequence) -> None:
 
     Raises InputError where the folder holds something already, so that two sequences never mix.
     """
-    folder = Path(folder).expanduser().absolute()
+    folder = expand_user(folder).absolute()
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InputError(f"{folder} is not empty: choose a new folder for the patterns")
     names = [f"{index:02d}_{_describe_frame(frame)}.png" for index, frame in enumerate(sequence.frames)]

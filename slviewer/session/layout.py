@@ -5,7 +5,8 @@ from pathlib import Path
 
 from slviewer import __version__
 from slviewer.errors import SessionError
-from slviewer.session.atomic import disk_errors, read_json, replace_json
+from slviewer.session.atomic import disk_errors, replace_json
+from slviewer.session.reading import expand_user, read_json
 
 SCHEMA = 1
 
@@ -95,4 +96,4 @@ def _is_leftover(entry: Path) -> bool:
 
 def _absolute_path(path: str | Path) -> Path:
     """Return an absolute path, with "~" expanded."""
-    return Path(path).expanduser().absolute()
+    return expand_user(path).absolute()

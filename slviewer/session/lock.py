@@ -8,7 +8,8 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
-from slviewer.errors import SessionError
+from slviewer.errors import DamagedError, SessionError
+from slviewer.session.reading import read_json
 
 _PATIENCE_S = 0.3  # outlasts a reader that holds the lock for the moment it needs to clear leftovers
 
@@ -59,7 +60,7 @@ class WriterLock:
     def _who(self) -> str:
         """Describe the process that holds the lock."""
         try:
-            holder = json.loads(self._holder.read_text())
+            holder = read_json(self._holder)
             return f"process {holder['pid']} on {holder['host']}"
-        except (OSError, ValueError, KeyError):
+        except (DamagedError, KeyError):
             return "another process"

@@ -9,16 +9,21 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 from slviewer.errors import InputError, SessionError
-from slviewer.registration.open3d_loader import open3d
+from slviewer.session.reading import expand_user, read_file
 from slviewer.surface.shapes import Mesh
 
 Units = Literal["mm", "cm", "m", "inch"]
 FORMATS = (".stl", ".ply", ".obj")
 MAX_BYTES = 1 << 28
-"""Of a file: five million triangles of a binary STL."""
-MAX_TRIANGLES = 5_000_000
+MAX_TEXT_BYTES = 1 << 27
+"""Of a text STL or OBJ: its numbers need several times its size while they are parsed."""
+MAX_TRIANGLES = 2_000_000
+MAX_CORNERS = 1000
+"""Of a polygon in an OBJ."""
 MM: dict[Units, float] = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "inch": 25.4}
 MAX_SIZE_RATIO = 5.0
 """A scan's size over the nominal's, or its inverse, from which on the units must be given."""
@@ -59,7 +64,7 @@ def read_nominal(path: Path | str, units: Units | None = None) -> Nominal:
     Raises SessionError for a file that cannot be used, with the reason: one that is absent, too large, damaged,
     truncated, of another format, or without triangles.
     """
-    path = Path(path).expanduser()
+    path = expand_user(path)
     data = _read_bytes(path)
     vertices, faces = _load_triangles(path.name, data)
     if not np.isfinite(vertices).all():
@@ -111,16 +116,10 @@ def _read_bytes(path: Path) -> bytes:
     if path.suffix.lower() not in FORMATS:
         raise SessionError(f"{path.name} is no nominal model that can be read: give an STL, PLY or OBJ file")
     try:
-        size = path.stat().st_size
-        if not path.is_file():
-            raise SessionError(f"{path} is no file: give an STL, PLY or OBJ file")
-        if size > MAX_BYTES:
-            raise SessionError(
-                f"{path.name} has {size / 1e6:.0f} MB, and up to {MAX_BYTES / 1e6:.0f} MB are read: decimate it first"
-            )
-        return path.read_bytes()
+        return read_file(path, MAX_BYTES)
     except OSError as error:
-        raise SessionError(f"{path} cannot be read ({error.strerror}): check its name") from error
+        reason = error.strerror or error
+        raise SessionError(f"{path} cannot be read ({reason}): give an STL, PLY or OBJ file of that size") from error
 
 
 def _load_triangles(name: str, data: bytes) -> tuple[np.ndarray, np.ndarray]:
@@ -128,15 +127,16 @@ def _load_triangles(name: str, data: bytes) -> tuple[np.ndarray, np.ndarray]:
     import trimesh
 
     form = name.rpartition(".")[2].lower()
+    data = _simplify(name, form, data)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             # from memory, so that other files that it may name are not opened; unprocessed, or points that are no
             # numbers would be dropped
             mesh: Any = trimesh.load(io.BytesIO(data), file_type=form, force="mesh", skip_materials=True, process=False)
-            if np.isfinite(mesh.vertices).all():
-                mesh.merge_vertices(merge_tex=True, merge_norm=True)
-            vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
+            vertices, faces = _weld(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64))
+    except MemoryError as error:
+        raise SessionError(f"{name} does not fit into the memory: decimate it first") from error
     except Exception as error:  # a file from anywhere may make its reader fail in any way
         raise SessionError(
             f"{name} cannot be read ({type(error).__name__}): it is damaged; export the model again, as triangles"
@@ -149,12 +149,65 @@ def _load_triangles(name: str, data: bytes) -> tuple[np.ndarray, np.ndarray]:
     if vertices.ndim != 2 or vertices.shape[1:] != (3,) or faces.ndim != 2 or faces.shape[1:] != (3,) or not len(faces):
         raise SessionError(f"{name} holds no triangles, or is damaged: export the model as a mesh")
     if len(faces) > MAX_TRIANGLES:
-        raise SessionError(
-            f"{name} has {len(faces):,} triangles, and at most {MAX_TRIANGLES:,} are read: decimate it first"
-        )
+        raise _too_many(name, f"{len(faces):,} triangles")
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise SessionError(f"{name} has triangles whose points are missing: export the model again")
     return vertices, faces
+
+
+def _simplify(name: str, form: str, data: bytes) -> bytes:
+    """Return a file without what only costs time: the groups of an OBJ, all but one of the sections of a text STL.
+
+    Raises SessionError for one of more triangles than are read, counted before anything is loaded.
+    """
+    is_text = form == "obj" or (form == "stl" and _is_text_stl(data))
+    if is_text and len(data) > MAX_TEXT_BYTES:
+        raise _too_many(name, f"{len(data) / 1e6:.0f} MB of text")
+    if form == "obj":
+        data = b"\n".join(re.findall(rb"^[ \t]*[vf][ \t][^\r\n]*", data.replace(b"\\\n", b" "), re.MULTILINE))
+        corners = max(map(len, map(bytes.split, re.findall(rb"^[ \t]*f[^\n]*", data, re.MULTILINE))), default=0)
+        if corners > MAX_CORNERS:
+            raise SessionError(f"{name} has a face of {corners - 1:,} corners: export the model again, as triangles")
+        count = data.count(b"f ") + data.count(b"f\t")
+    elif form == "ply":
+        declared = re.search(rb"element face (\d{1,12})\b", data[:65536])
+        count = int(declared[1]) if declared else 0
+    elif is_text:
+        data = re.sub(rb"(?im)^[ \t]*endsolid[^\n]*\n\s*solid[^\n]*\n", b"", data)
+        count = data.lower().count(b"endfacet")
+    else:
+        count = int.from_bytes(data[80:84], "little")
+        if len(data) < 84 + 50 * count:
+            raise SessionError(
+                f"{name} holds no triangles, or is truncated: it announces {count:,} triangles; export the model again"
+            )
+    if count > MAX_TRIANGLES:
+        raise _too_many(name, f"{count:,} triangles")
+    return data
+
+
+def _weld(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (n, 3) without those that repeat others to 8 decimals, and faces (m, 3) with their new indices."""
+    rounded = np.round(vertices, 8) + 0.0  # no negative zeros
+    mixed = np.zeros(len(rounded), np.uint64)
+    for column in rounded.T.copy().view(np.uint64):
+        mixed = (mixed ^ column) * np.uint64(11400714819323198485)
+        mixed ^= mixed >> np.uint64(29)
+    _, first, inverse = np.unique(mixed, return_index=True, return_inverse=True)
+    if not np.array_equal(rounded[first[inverse]], rounded, equal_nan=True):  # two points share a hash: all are kept
+        return vertices, faces
+    return vertices[first], inverse[faces]
+
+
+def _is_text_stl(data: bytes) -> bool:
+    """Return whether an STL is text: it begins with "solid", and is not of the size that a binary one announces."""
+    binary = len(data) >= 84 and len(data) == 84 + 50 * int.from_bytes(data[80:84], "little")
+    return data[:512].lstrip().lower().startswith(b"solid") and not binary
+
+
+def _too_many(name: str, amount: str) -> SessionError:
+    """Return the error for a model that is too large."""
+    return SessionError(f"{name} has {amount}, and at most {MAX_TRIANGLES:,} triangles are read: decimate it first")
 
 
 def _drop_degenerate(
@@ -170,29 +223,37 @@ def _drop_degenerate(
     if flat:
         notes.append(f"{flat:,} of {len(faces):,} triangles without area were removed")
     faces = faces[sound]
+    # the smallest index first, so that equal triangles have equal rows
+    rolled = np.take_along_axis(faces, (np.argmin(faces, axis=1)[:, None] + np.arange(3)) % 3, axis=1)
+    order = np.lexsort(rolled.T[::-1])
+    repeated = order[1:][(np.diff(rolled[order], axis=0) == 0).all(axis=1)]
+    if len(repeated):
+        notes.append(f"{len(repeated):,} of {len(faces):,} triangles were repetitions of others: they were removed")
+        faces = np.delete(faces, repeated, axis=0)
     used, faces = np.unique(faces, return_inverse=True)
     return vertices[used].astype(np.float32), faces.reshape(-1, 3).astype(np.int32)
 
 
 def _orient_faces(vertices: np.ndarray, faces: np.ndarray, notes: list[str]) -> tuple[np.ndarray, bool]:
     """Return the faces wound consistently, outwards where the model is closed; and whether it is closed."""
-    o3d = open3d()
-    mesh = o3d.geometry.TriangleMesh(
-        o3d.utility.Vector3dVector(vertices.astype(np.float64)), o3d.utility.Vector3iVector(faces)
-    )
-    closed = bool(mesh.is_edge_manifold(allow_boundary_edges=False))
-    directed = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(np.int64)
-    keys = directed[:, 0] * (len(vertices) + 1) + directed[:, 1]
-    twice = len(keys) - len(np.unique(keys))  # neighbours that turn alike run along their side in opposite directions
-    if twice:
-        if mesh.orient_triangles():
-            faces = _orient_by_majority(vertices, faces, np.asarray(mesh.triangles).astype(np.int32))
-            notes.append("its triangles did not all turn one way: they were turned")
-        else:
+    directed = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64)
+    forward = directed[:, 0] < directed[:, 1]
+    keys = np.where(forward, directed[:, 0], directed[:, 1]) * (len(vertices) + 1) + directed.max(axis=1)
+    order = np.argsort(keys, kind="stable")
+    sides = np.diff(np.flatnonzero(np.concatenate([[True], np.diff(keys[order]) != 0, [True]])))
+    closed, manifold = bool((sides == 2).all()), bool((sides <= 2).all())
+    pair = np.flatnonzero(np.diff(keys[order]) == 0)  # of a manifold: the places of each edge that two faces share
+    one, other = order[pair], order[pair + 1]
+    alike = forward[one] == forward[other]  # neighbours that turn alike run along their side in opposite directions
+    if alike.any():
+        turned = _turn_alike(vertices, faces, one // 3, other // 3, alike) if manifold else None
+        if turned is None:
             notes.append(
                 "its triangles do not all turn one way, and cannot be turned: some deviations may have the wrong sign"
             )
             return faces, False
+        faces = turned
+        notes.append("its triangles did not all turn one way: they were turned")
     if closed:
         a, b, c = (vertices[faces[:, k]].astype(np.float64) - vertices.mean(axis=0) for k in range(3))
         if float(np.sum(a * np.cross(b, c))) < 0:
@@ -203,19 +264,23 @@ def _orient_faces(vertices: np.ndarray, faces: np.ndarray, notes: list[str]) -> 
     return faces, closed
 
 
-def _orient_by_majority(vertices: np.ndarray, before: np.ndarray, turned: np.ndarray) -> np.ndarray:
-    """Triangles (m, 3) that were turned alike, each part of the surface the way in which most of its area faced before:
-    they are turned after the first one, which may be the one that was wrong."""
-    from trimesh import graph
-
-    first, second = (_area_vectors(vertices, faces) for faces in (before, turned))
-    against = -np.sum(first * second, axis=1) / np.maximum(np.linalg.norm(first, axis=1), 1e-300)
-    part = graph.connected_component_labels(graph.face_adjacency(before), node_count=len(before))
-    wrong = np.bincount(part, against)[part] > 0
-    return np.where(wrong[:, None], turned[:, ::-1], turned)
-
-
-def _area_vectors(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Return the normals (m, 3) of triangles, with a length of twice their area."""
+def _turn_alike(
+    vertices: np.ndarray, faces: np.ndarray, one: np.ndarray, other: np.ndarray, alike: np.ndarray
+) -> np.ndarray | None:
+    """Faces (m, 3) turned one way, each part of the surface the way in which most of its area faces; None where that is
+    impossible. ``one``, ``other`` (k,): faces that share an edge, ``alike`` (k,): one of the two has to be turned."""
+    m = len(faces)
+    # a node for each face as it is, and one for it turned: two components a part, which are its two orientations
+    start = np.concatenate([one, one + m])
+    end = np.concatenate([np.where(alike, other + m, other), np.where(alike, other, other + m)])
+    links = coo_matrix((np.ones(len(start), np.int8), (start, end)), (2 * m, 2 * m))
+    labels = connected_components(links, directed=False)[1]
+    as_is, turned = labels[:m], labels[m:]
+    if (as_is == turned).any():
+        return None
     a, b, c = (vertices[faces[:, k]].astype(np.float64) for k in range(3))
-    return np.cross(b - a, c - a)
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    kept = np.bincount(as_is, area, int(labels.max()) + 1)  # area that an orientation leaves as it is
+    wrong = kept[as_is] < kept[turned]
+    wrong |= (kept[as_is] == kept[turned]) & (as_is > turned)
+    return np.where(wrong[:, None], faces[:, ::-1], faces)

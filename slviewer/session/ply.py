@@ -9,6 +9,7 @@ import numpy as np
 from slviewer import __version__
 from slviewer.errors import InputError
 from slviewer.session.atomic import arriving_file
+from slviewer.session.reading import MAX_CLOUD_BYTES, decoding, read_file
 
 COLOURS = ("red", "green", "blue")
 TYPES = {"float": "<f4", "double": "<f8", "uchar": "u1", "int": "<i4"}
@@ -81,18 +82,26 @@ def read_ply(path: str | Path) -> Ply:
     """
     path = Path(path)
     try:
-        data = path.read_bytes()
+        data = read_file(path, MAX_CLOUD_BYTES)
     except OSError as error:
-        raise InputError(f"{path} cannot be read ({error.strerror}): check its name.") from None
+        raise InputError(f"{path} cannot be read ({error.strerror or error}): check its name.") from None
     end = data.find(b"end_header\n")
     lines = [line.split() for line in data[: max(end, 0)].decode("ascii", "replace").splitlines()]
     if lines[:2] != [["ply"], ["format", "binary_little_endian", "1.0"]]:
         raise InputError(f"{path} is no binary little-endian PLY: only files that slviewer wrote can be read back.")
+    with decoding(path, InputError):
+        return _parse_ply(path, data, end, lines[2:])
+
+
+def _parse_ply(path: Path, data: bytes, end: int, lines: list[list[str]]) -> Ply:
+    """Return the content of a PLY from its bytes and the words of its header's ``lines``."""
     counts: dict[str, int] = {}
     properties: list[tuple[str, str]] = []
-    for words in lines[2:]:
+    for words in lines:
         if words[0] == "element":
             counts[words[1]] = int(words[2])
+            if counts[words[1]] < 0:
+                raise ValueError("a negative number of elements")
         elif words[0] == "property" and list(counts) == ["vertex"] and words[1] in TYPES:
             properties.append((words[2], TYPES[words[1]]))
         elif words[0] == "property" and words[1:] != ["list", "uchar", "int", "vertex_indices"]:

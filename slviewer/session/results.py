@@ -6,6 +6,8 @@ none, and only `verify_result` tells whether they are damaged.
 
 import hashlib
 import io
+import math
+import os
 from collections.abc import Collection, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -15,12 +17,15 @@ import google_crc32c
 import numpy as np
 
 from slviewer.errors import DamagedError, InputError
-from slviewer.session.atomic import read_json, to_json, write_bytes, write_json
+from slviewer.session.atomic import to_json, write_bytes, write_json
 from slviewer.session.layout import inner_folders
 from slviewer.session.names import safe_path
+from slviewer.session.reading import decoding, open_regular, read_file, read_json
+from slviewer.session.result_types import Meta, check_meta
 
 _ARRAY_FOLDER = "arrays"
 _RESERVED = {"hash", "arrays", "checksums"}
+MAX_ARRAY_BYTES = 1 << 33
 
 
 def list_results(root: Path) -> list[str]:
@@ -76,8 +81,16 @@ def write_result(folder: Path, meta: Mapping[str, Any], arrays: Mapping[str, np.
 
 
 def read_meta(folder: Path) -> dict[str, Any]:
-    """`meta` as it was saved, with its content `hash` and the names and checksums of its `arrays`."""
-    return read_json(folder / "meta.json")
+    """`meta` as it was saved, with its content `hash` and the names and checksums of its `arrays`.
+
+    Raises DamagedError where these, or its `inputs`, are not what the session writes.
+    """
+    meta = read_json(folder / "meta.json")
+    with decoding(folder / "meta.json"):
+        check_meta("/".join(folder.parts[-2:]), meta)
+        for name in meta.get("arrays", ()):
+            safe_path(name)
+    return Meta(folder / "meta.json", meta)
 
 
 def verify_result(folder: Path) -> None:
@@ -85,7 +98,10 @@ def verify_result(folder: Path) -> None:
     meta = read_meta(folder)
     names = meta.get("arrays", [])
     try:
-        digests = {n: hashlib.blake2b(_array_path(folder, n).read_bytes(), digest_size=20).digest() for n in names}
+        digests = {
+            n: hashlib.blake2b(read_file(_array_path(folder, n), MAX_ARRAY_BYTES), digest_size=20).digest()
+            for n in names
+        }
     except OSError as error:
         raise _damage(folder, str(error)) from error
     if _combine_digests({key: meta[key] for key in meta if key not in _RESERVED}, digests) != meta.get("hash"):
@@ -103,12 +119,33 @@ def read_arrays(folder: Path, only: Collection[str] | None = None) -> dict[str, 
         if only is not None and name not in only:
             continue
         try:
-            arrays[name] = np.load(_array_path(folder, name), allow_pickle=False)
-        except (OSError, ValueError, EOFError, MemoryError) as error:
+            arrays[name] = _read_array(_array_path(folder, name))
+        except (OSError, ValueError, EOFError, KeyError, SyntaxError, MemoryError) as error:
             raise _damage(folder, f"array {name}: {error}") from error
         if name in checksums and _checksum(_make_header(arrays[name]), arrays[name]) != checksums[name]:
             raise _damage(folder, f"array {name} differs from its checksum")
     return arrays
+
+
+def _hash_file(path: Path) -> bytes:
+    """Return the digest of a file of an array."""
+    return hashlib.blake2b(read_file(path, MAX_ARRAY_BYTES), digest_size=20).digest()
+
+
+def _read_array(path: Path) -> np.ndarray:
+    """Read a .npy file. Raises ValueError unless it holds exactly the numbers or texts that its header announces."""
+    with open_regular(path) as file:
+        header = np.lib.format
+        read_header = {(1, 0): header.read_array_header_1_0, (2, 0): header.read_array_header_2_0}
+        shape, _, dtype = read_header[header.read_magic(file)](file)
+        size, start = os.fstat(file.fileno()).st_size, file.tell()
+        if dtype.kind not in "biufU" or any(extent < 0 for extent in shape):
+            raise ValueError(f"it holds {dtype} {shape}, no numbers")
+        if math.prod(shape) * dtype.itemsize != size - start:
+            raise ValueError(f"its {size} bytes are not those of {dtype} {shape}")
+        file.seek(0)
+        array: np.ndarray = np.load(file, allow_pickle=False)
+        return array
 
 
 def _array_path(folder: Path, name: str) -> Path:

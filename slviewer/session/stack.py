@@ -19,7 +19,8 @@ import google_crc32c
 import numpy as np
 
 from slviewer.errors import DamagedError, InputError, SessionError
-from slviewer.session.atomic import read_json, write_bytes
+from slviewer.session.atomic import write_bytes
+from slviewer.session.reading import read_json
 
 _THREADS = 4  # moving and hashing frames releases the interpreter; more threads only queue for the disk
 _SEPARATOR = "."

@@ -24,9 +24,12 @@ from slviewer.session.capture import (
 from slviewer.session.layout import create_layout, inner_folders, is_session, new_folder, remove_layout, session_folder
 from slviewer.session.lock import WriterLock
 from slviewer.session.names import is_safe_name, natural_key, safe_name, safe_path
+from slviewer.session.reading import expand_user
+from slviewer.session.result_types import read_decisions
 from slviewer.session.results import check_place, check_result, list_results, read_arrays, read_meta, write_result
 
 _CREATION_ATTEMPTS = 5
+_MAX_INPUTS_CHAIN = 32
 
 State = Literal["absent", "fresh", "stale"]
 
@@ -93,7 +96,7 @@ class Session:
             try:
                 return cls.open(path, write=True) if was_session else cls.create(path)
             except SessionError:
-                if is_session(path) == was_session and Path(path).expanduser().exists():
+                if is_session(path) == was_session and expand_user(path).exists():
                     raise
         return cls.create(path)
 
@@ -330,21 +333,23 @@ class Session:
     def state_of(self, name: str) -> State:
         """Return `fresh`, `stale` or `absent`; fresh if every input of the result is fresh and has the hash it had.
 
-        A damaged input makes it stale; DamagedError where the result's own description is damaged.
+        A damaged input makes it stale, as do inputs in a circle; DamagedError where its own description is damaged.
         """
+        return self._state_of(name, {}, 0)
+
+    def _state_of(self, name: str, known: dict[str, State], depth: int) -> State:
+        """Return the state of a result ``depth`` inputs away; ``known``: states of those that were met before."""
         folder = self.folder / "results" / safe_path(name)
-        if not (folder / "meta.json").is_file():
-            return "absent"
-        inputs = read_meta(folder).get("inputs", {})
-        try:
-            for input_name, used in inputs.items():
-                if used not in self._hashes(input_name):
+        if name in known or not (folder / "meta.json").is_file():
+            return known.get(name, "absent")
+        inputs, known[name] = read_meta(folder).get("inputs", {}), "stale"  # while it is examined, or if that fails
+        with contextlib.suppress(DamagedError, InputError):
+            for other, used in inputs.items():
+                changed = used not in self._hashes(other) or depth == _MAX_INPUTS_CHAIN
+                if changed or (other != name and self._state_of(other, known, depth + 1) == "stale"):
                     return "stale"
-                if input_name != name and self.state_of(input_name) == "stale":
-                    return "stale"
-        except DamagedError:
-            return "stale"
-        return "fresh"
+            known[name] = "fresh"
+        return known[name]
 
     def load_fresh(
         self, name: str, only: Collection[str] | None = None
@@ -376,8 +381,7 @@ class Session:
 
     def decision(self, what: str) -> Any:
         """What was decided last; None where nothing was."""
-        path = self.folder / "decisions.json"
-        return atomic.read_json(path).get(what) if path.exists() else None
+        return read_decisions(self.folder / "decisions.json").get(what)
 
     def save_rig(self, name: str, text: str) -> Path:
         """Keep the operator's own rig, TOML, in place of one of that name; returns its file."""
@@ -480,9 +484,8 @@ class Session:
 
     def _hashes(self, name: str) -> list[str]:
         """Content hashes of the capture and of the result of that name, where there are any."""
-        content_hashes = []
-        if "/" not in name and self._has_description(name):
-            content_hashes.append(self.load_capture(name).hash)
+        is_capture = "/" not in name and self._has_description(name)
+        content_hashes = [self.load_capture(name).hash] if is_capture else []
         folder = self.folder / "results" / safe_path(name)
         if (folder / "meta.json").is_file():
             content_hashes.append(str(read_meta(folder).get("hash")))
@@ -493,5 +496,5 @@ class Session:
         self._require_writer()
         path = self.folder / "decisions.json"
         with self._decisions_lock:
-            decisions = atomic.read_json(path) if path.exists() else {}
+            decisions = read_decisions(path)
             atomic.replace_json(path, {**decisions, what: change(decisions.get(what))})

@@ -23,6 +23,7 @@ from slviewer.pipeline.poses import read_stored_poses
 from slviewer.pipeline.rig_choice import Choice, RigSetup, SetUp, needs_page
 from slviewer.pipeline.rig_presets import save_rig
 from slviewer.session.capture import Capture
+from slviewer.session.reading import expand_user
 from slviewer.session.store import Session
 from slviewer.target.board import Board
 from slviewer.wizard.acquisition import Acquisition
@@ -116,7 +117,7 @@ class Engine:
             if not self.acquisition.idle:
                 raise InputError("a capture is running: wait for it, or cancel it, before you open another session")
             before = self.session
-            if before is not None and Path(path).expanduser().resolve() == before.folder.resolve():
+            if before is not None and expand_user(path).resolve() == before.folder.resolve():
                 if rig:
                     self._restore_rig(before, rig)
                 return

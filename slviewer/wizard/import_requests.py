@@ -11,6 +11,7 @@ from slviewer.pipeline.import_captures import import_captures
 from slviewer.session import atomic
 from slviewer.session.importers.archive import unpack, unpacked_size
 from slviewer.session.names import safe_name
+from slviewer.session.reading import expand_user
 from slviewer.wizard.jobs import Reporter
 from slviewer.wizard.requests import RequestHandler, request
 
@@ -33,7 +34,7 @@ class ImportRequests(RequestHandler):
         def work(report: Reporter) -> list[str]:
             """Import the folder's captures; returns their names."""
             session = store.guarded(report.saving)
-            source = Path(path).expanduser()
+            source = expand_user(path)
             return import_captures(source, session, layout, progress=report, warn=self._warn, **options)
 
         self._submit_import(work)

@@ -107,7 +107,7 @@ def test_mistakes_are_named(fake: None, change: dict, message: str, tmp_path: Pa
 def test_files_and_names_that_are_none_are_named(fake: None, tmp_path: Path):
     (tmp_path / "broken.toml").write_text("driver = ")
     for rig, message in (
-        (tmp_path / "broken.toml", "cannot be read as TOML"),
+        (tmp_path / "broken.toml", "is not TOML"),
         (tmp_path / "absent.toml", "there is no file"),
         ("simulatd", "no rig is called 'simulatd': use .*simulated"),
     ):

@@ -57,7 +57,6 @@ A sequence that was taken in several exposures names them: each entry has `expos
 frames. They become one capture, in which each pixel comes from the longest exposure that did not saturate it.
 """
 
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -74,6 +73,7 @@ from slviewer.session.importers.imported import (
     listed,
     strangers_warning,
 )
+from slviewer.session.reading import read_toml
 
 _KEYS = {*SEQUENCE_KEYS, "frames", "order", "channel"}
 
@@ -162,15 +162,7 @@ def read(source: Path, toml: Path, *, prefix: str | None = None, projector: tupl
 def read_description(toml: Path, projector: tuple[int, int] | None = None) -> Description:
     """What a TOML describes; `projector` is for one that does not state the size. Raises InputError."""
     toml = Path(toml)
-    try:
-        with open(toml, "rb") as file:
-            data = tomllib.load(file)
-    except OSError as error:
-        raise InputError(
-            f"{toml} cannot be read ({error.strerror}): give the TOML that describes the frames"
-        ) from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{toml.name} is not TOML ({error}): correct it there") from error
+    data = read_toml(toml)
     if unknown := sorted(set(data) - _KEYS):
         raise InputError(f"{toml.name} has the unknown entry '{unknown[0]}': use {', '.join(sorted(_KEYS))}")
     if data.get("channel") not in (None, *get_args(Channel)):

@@ -8,6 +8,7 @@ from slviewer.fringe.guess import Guess, guess_sequence
 from slviewer.session.importers.frame_groups import images_by_name
 from slviewer.session.importers.images import DEFAULT_CHANNEL, Channel, read_frames
 from slviewer.session.importers.imported import listed, visible
+from slviewer.session.reading import expand_user
 from slviewer.session.toml import format_value, table_lines
 
 
@@ -28,7 +29,7 @@ def guess_description(
     Of a folder of captures, the first is read. Raises InputError where there are no images, or they cannot belong to
     one capture (other sizes, damaged).
     """
-    folder = _capture_folder(Path(folder).expanduser())
+    folder = _capture_folder(expand_user(folder))
     files = images_by_name(folder)
     images = read_frames(files, channel=channel or DEFAULT_CHANNEL)
     guess = guess_sequence(images.stack, projector)

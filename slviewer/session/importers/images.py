@@ -1,5 +1,6 @@
 """Image files into one stack, and none of them believed without a look: OpenCV decodes half a file without a word."""
 
+import re
 import struct
 import zlib
 from collections.abc import Sequence
@@ -13,12 +14,14 @@ import numpy as np
 
 from slviewer.errors import InputError
 from slviewer.fringe.layout import clip_level
+from slviewer.session.reading import MAX_IMAGE_BYTES, read_file
 
 IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm"}
 
 Channel = Literal["red", "green", "blue", "luma", "max"]
 DEFAULT_CHANNEL: Channel = "green"
 
+MAX_PIXELS = 160_000_000
 _THREADS = 4  # decoding releases the interpreter
 _PNG = b"\x89PNG\r\n\x1a\n"
 _JPEG = b"\xff\xd8"
@@ -44,7 +47,12 @@ def read_frames(
     file, for an image that is missing, cut short, damaged, of another size or bit depth than the first, or transparent.
     """
     first = read_image(paths[0])
-    stack = np.empty((len(paths), *first.shape[:2]), first.dtype)
+    try:
+        stack = np.empty((len(paths), *first.shape[:2]), first.dtype)
+    except MemoryError as error:
+        raise InputError(
+            f"{len(paths)} images of {_format_size(first)} px do not fit into the memory: {error}"
+        ) from error
     texture: list[np.ndarray] = []
     in_colour = np.zeros(len(paths), bool)
 
@@ -83,14 +91,20 @@ def reduce_channels(image: np.ndarray, channel: Channel) -> np.ndarray:
 def read_image(path: Path) -> np.ndarray:
     """(h, w) or (h, w, 3) BGR, uint8 or uint16. Raises InputError for anything that is not wholly an image."""
     try:
-        data = path.read_bytes()
+        data = read_file(path, MAX_IMAGE_BYTES)
     except OSError as error:
-        raise InputError(f"{_short_path(path)} cannot be read ({error.strerror}): check the file") from error
+        raise InputError(f"{_short_path(path)} cannot be read ({error.strerror or error}): check the file") from error
     if fault := _describe_fault(data):
         raise InputError(f"{_short_path(path)} is {fault}: copy or record it again")
+    width, height = _announced_size(data)
+    if width * height > MAX_PIXELS:
+        raise InputError(
+            f"{_short_path(path)} is {width}x{height} px, and images of up to {MAX_PIXELS / 1e6:.0f} megapixels are "
+            "read: crop it, or record it at a lower resolution"
+        )
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    except cv2.error:
+    except (cv2.error, MemoryError):
         image = None
     if image is None:
         raise InputError(f"{_short_path(path)} is not a readable image: copy or record it again")
@@ -150,6 +164,39 @@ def _describe_png_fault(data: bytes) -> str | None:
             return None
         at = end
     return "cut short (its PNG end is missing)"
+
+
+def _announced_size(data: bytes) -> tuple[int, int]:
+    """Return (width, height) px that the header of an image announces, (0, 0) where it has none that is known."""
+    if data.startswith(_PNG) and len(data) >= 24:
+        return struct.unpack_from(">II", data, 16)  # type: ignore[return-value]
+    if data.startswith(b"BM") and len(data) >= 26:
+        width, height = struct.unpack_from("<ii", data, 18)
+        return abs(width), abs(height)
+    if netpbm := re.match(rb"P[1-7](?:\s+|#[^\n]*\n)+(\d{1,9})(?:\s+|#[^\n]*\n)+(\d{1,9})", data[:1000]):
+        return int(netpbm[1]), int(netpbm[2])
+    if data.startswith((b"II*\0", b"MM\0*")) and len(data) >= 8:
+        return _tiff_size(data)
+    at = 2
+    while data.startswith(_JPEG) and at + 9 <= len(data) and data[at] == 0xFF:
+        marker, (length,) = data[at + 1], struct.unpack_from(">H", data, at + 2)
+        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
+            height, width = struct.unpack_from(">HH", data, at + 5)
+            return width, height
+        at += 1 if marker == 0xFF else 2 + length
+    return 0, 0
+
+
+def _tiff_size(data: bytes) -> tuple[int, int]:
+    """Return (width, height) px of the first image of a TIFF file, (0, 0) where it states none."""
+    order, size = "<" if data.startswith(b"II") else ">", {}
+    (at,) = struct.unpack_from(f"{order}I", data, 4)
+    (entries,) = struct.unpack_from(f"{order}H", data, at) if at + 2 <= len(data) else (0,)
+    for entry in range(at + 2, min(at + 2 + 12 * entries, len(data) - 11), 12):
+        tag, form = struct.unpack_from(f"{order}HH", data, entry)
+        if tag in (256, 257) and form in (3, 4):
+            (size[tag],) = struct.unpack_from(order + ("H" if form == 3 else "I"), data, entry + 8)
+    return size.get(256, 0), size.get(257, 0)
 
 
 def _jpeg_ends(data: bytes) -> bool:

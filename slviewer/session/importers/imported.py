@@ -12,6 +12,7 @@ from slviewer.fringe.sequence import PatternSequence
 from slviewer.session.capture import NewCapture
 from slviewer.session.importers.images import DEFAULT_CHANNEL, IMAGE_SUFFIXES, Channel, read_frames
 from slviewer.session.names import natural_key, safe_name
+from slviewer.session.reading import expand_user
 
 _MOST_REASONS = 3
 
@@ -183,7 +184,7 @@ def _capture_folders(
     source: Path, is_capture: Callable[[Path], bool], looks_like: str
 ) -> tuple[list[Path], list[Path], list[str]]:
     """Capture folders in counting order, folders that are only named like these, and warnings about all others."""
-    source = Path(os.path.abspath(Path(source).expanduser()))  # a link keeps its own name
+    source = Path(os.path.abspath(expand_user(source)))  # a link keeps its own name
     if not source.is_dir():
         raise InputError(f"{source} is no folder: give the folder of a capture, or a folder of such folders")
     if is_capture(source):

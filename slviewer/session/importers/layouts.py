@@ -5,6 +5,7 @@ from pathlib import Path
 from slviewer.errors import InputError
 from slviewer.session.importers import frames, opencv_graycode, p18, procam_calibration, slstudio, sltk
 from slviewer.session.importers.imported import FolderLayout, visible
+from slviewer.session.reading import expand_user
 
 LAYOUTS = {
     layout.name: layout
@@ -24,7 +25,7 @@ def detect_layout(source: Path) -> str:
 
     A TOML in the folder describes the images: it decides.
     """
-    source = Path(source).expanduser()
+    source = expand_user(source)
     if not source.is_dir():
         raise InputError(f"{source} is no folder: give the folder of a capture, or a folder of such folders")
     if find_description(source) is not None:

@@ -1,0 +1,127 @@
+"""Files from outside: the one place that opens and parses them, within limits of size, depth and numbers.
+
+Only regular files are read (a pipe or a device would never end), and none larger than its kind may be. What JSON and
+TOML hold is limited to what a record needs: `MAX_DEPTH` levels and integers of 64 bits, so that nothing that walks it
+later runs out of stack or range.
+"""
+
+import json
+import os
+import re
+import stat
+import tomllib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from slviewer.errors import DamagedError, InputError
+
+MAX_JSON_BYTES = 1 << 26
+MAX_TOML_BYTES = 1 << 20
+MAX_IMAGE_BYTES = 1 << 29
+MAX_CLOUD_BYTES = 1 << 31
+MAX_DEPTH = 32
+_MAX_INTEGER = 1 << 63
+_LONE_SURROGATE = re.compile("[\ud800-\udfff]")
+_INVALID = (KeyError, TypeError, ValueError, AttributeError, IndexError, ArithmeticError, RecursionError, MemoryError)
+"""What a decoder raises that meets a value that it does not expect."""
+
+
+def open_regular(path: Path) -> BinaryIO:
+    """Open a regular file for reading. Raises OSError for anything else: a folder, a pipe, a device."""
+    # without O_NONBLOCK, opening a pipe waits for its writer; for regular files it changes nothing
+    descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
+    try:
+        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+            raise OSError(f"it is no regular file: {path}")
+        return os.fdopen(descriptor, "rb")
+    except BaseException:
+        os.close(descriptor)
+        raise
+
+
+def read_file(path: Path, max_bytes: int) -> bytes:
+    """Return the content of a regular file. Raises OSError for any other, and for one of more than ``max_bytes``."""
+    with open_regular(path) as file:
+        size = os.fstat(file.fileno()).st_size
+        if size > max_bytes:
+            raise OSError(f"it has {size / 1e6:.0f} MB, and {max_bytes / 1e6:.0f} MB are read at most")
+        return file.read(size)  # of a growing file, what it had
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """The object in a JSON file; DamagedError where the file is damaged or holds no object."""
+    remedy = "restore it from a copy, or move its folder away"
+    try:
+        data = _check_values(json.loads(read_file(path, MAX_JSON_BYTES)))
+    except (ValueError, OSError, RecursionError, MemoryError) as error:
+        raise DamagedError(f"{path} cannot be read ({_reason(error)}): {remedy}") from error
+    if not isinstance(data, dict):
+        raise DamagedError(f"{path} holds no JSON object: {remedy}")
+    return data
+
+
+def read_toml(path: Path | str) -> dict[str, Any]:
+    """The tables of a TOML file. Raises InputError where it cannot be read, with the reason."""
+    path = expand_user(path)
+    try:
+        data: dict[str, Any] = _check_values(tomllib.loads(read_file(path, MAX_TOML_BYTES).decode()))
+    except OSError as error:
+        raise InputError(f"{path} cannot be read ({_reason(error)}): give the TOML file that is needed here") from error
+    except (ValueError, RecursionError, MemoryError) as error:
+        raise InputError(f"{path} is not TOML ({_reason(error)}): correct it there") from error
+    return data
+
+
+def expand_user(path: Path | str) -> Path:
+    """Return the path with the "~" of a home folder expanded, where that user exists."""
+    try:
+        return Path(path).expanduser()
+    except RuntimeError as error:
+        raise InputError(f"{path} names a user that does not exist here: give the whole path") from error
+
+
+@contextmanager
+def decoding(place: Path | str, error: Callable[[str], Exception] = DamagedError) -> Iterator[None]:
+    """Context manager for decoding values read from ``place``: raise what unexpected ones cause as ``error``."""
+    try:
+        yield
+    except InputError as fault:
+        raise error(f"{place} is damaged ({fault}): restore it from a copy, or compute or import it again") from fault
+    except _INVALID as fault:
+        raise error(
+            f"{place} is damaged ({type(fault).__name__}: {_reason(fault)}): "
+            "restore it from a copy, or compute or import it again"
+        ) from fault
+
+
+def _check_values(data: Any) -> Any:
+    """Return plain values unchanged. Raises ValueError for nesting, integers or text that no record has."""
+    level = [data]
+    for _ in range(MAX_DEPTH):
+        inner: list[Any] = []
+        for value in level:
+            kind = type(value)
+            if kind is dict:
+                inner += value
+                inner += value.values()
+            elif kind is list:
+                inner += value
+            elif kind is int and not -_MAX_INTEGER <= value < _MAX_INTEGER:
+                raise ValueError("an integer of more than 64 bits")
+            elif kind is str and not value.isascii() and _LONE_SURROGATE.search(value):
+                raise ValueError("text that is no Unicode")
+        if not inner:
+            return data
+        level = inner
+    raise ValueError(f"nested more than {MAX_DEPTH} deep")
+
+
+def _reason(error: BaseException) -> str:
+    """Return the reason of an error in a few words."""
+    if isinstance(error, RecursionError):
+        return "nested too deep"
+    if isinstance(error, OSError):
+        return str(error.strerror or error)
+    return " ".join(str(error).split())[:300] or type(error).__name__

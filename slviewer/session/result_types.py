@@ -1,0 +1,320 @@
+"""The types of what `meta.json` and `decisions.json` hold, by kind: what is read is checked against them first.
+
+Every entry that a reader uses is named here with its type; a reader then needs no check of its own. An entry may be
+absent, as older versions had fewer: reading one that is needed raises DamagedError (`Meta`). Others are ignored. Arrays
+have their shapes checked by the classes that are made of them.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal, Required, TypedDict
+
+import msgspec
+
+from slviewer.errors import DamagedError
+from slviewer.fringe.sequence import Axis
+from slviewer.records import from_plain
+from slviewer.session.reading import decoding, read_json
+
+Extent = Annotated[int, msgspec.Meta(ge=1, le=1 << 16)]
+Size = tuple[Extent, Extent]
+_Triple = tuple[float, float, float]
+_Matrix3 = tuple[_Triple, _Triple, _Triple]
+_Row4 = tuple[float, float, float, float]
+_Matrix4 = tuple[_Row4, _Row4, _Row4, _Row4]
+_Count = Annotated[int, msgspec.Meta(ge=0)]
+_Exposure = Annotated[float, msgspec.Meta(gt=0, lt=1e9)]
+
+
+class Meta(dict[str, Any]):
+    """The entries of a `meta.json`; DamagedError, with its path, for one that is read and missing."""
+
+    def __init__(self, place: Path, entries: Mapping[str, Any]) -> None:
+        super().__init__(entries)
+        self._place = place
+
+    def __missing__(self, key: str) -> Any:
+        raise DamagedError(f"{self._place} lacks the entry {key!r}: restore it from a copy, or compute it again")
+
+
+class ResultMeta(TypedDict, total=False):
+    """The entries of every result."""
+
+    hash: str
+    arrays: list[str]
+    checksums: dict[str, int]
+    inputs: dict[str, str]
+    scales: dict[str, float]
+
+
+class _Imported(TypedDict):
+    """The matrices of a calibration made elsewhere."""
+
+    K_camera: _Matrix3
+    D_camera: list[float | list[float]]
+    K_projector: _Matrix3
+    D_projector: list[float | list[float]]
+    R: _Matrix3
+    T: list[float | list[float]]
+
+
+class _Stereo(ResultMeta, total=False):
+    """`calibration/stereo`: computed (``model``, ``settings``), or imported with its source and sizes."""
+
+    model: dict[str, Any]
+    settings: dict[str, Any]
+    verdict: dict[str, Any] | None
+    imported: _Imported
+    source: str
+    camera: Size | None
+    projector: Size | None
+
+
+class _Fitted(ResultMeta, total=False):
+    """`calibration/pixelwise` and `calibration/splined`."""
+
+    model: dict[str, Any]
+    settings: dict[str, Any]
+
+
+class _Verdict(ResultMeta, total=False):
+    """`calibration/verdict`."""
+
+    verdict: dict[str, Any]
+
+
+class _Validation(ResultMeta, total=False):
+    """`calibration/validation`."""
+
+    validation: dict[str, Any]
+
+
+class _Compiled(ResultMeta, total=False):
+    """`compiled/splined`."""
+
+    version: int
+    compiled: dict[str, Any]
+
+
+class _Pose(ResultMeta, total=False):
+    """`poses/*`."""
+
+    target: str
+    smoothing: list[str | int]
+    reading: int
+    refused: str
+
+
+class _Evidence(ResultMeta, total=False):
+    """`evidence/*`."""
+
+    target: str
+    look: int
+    evidence: dict[str, Any]
+
+
+class _FrameCheck(ResultMeta, total=False):
+    """`trust/*`."""
+
+    version: int
+    axes: list[dict[str, Any]]
+    contradictions: list[dict[str, Any]]
+
+
+class _Cloud(ResultMeta, total=False):
+    """`clouds/*`."""
+
+    model: str
+    axis: Axis
+    points: int
+    depth_mm: tuple[float, float] | None
+    noise_mm: float | None
+    masked: float | None
+    scale: str
+
+
+class _VerifiedModel(TypedDict, total=False):
+    """The figures of one model in a verification."""
+
+    points: Required[_Count]
+    set_aside: Required[_Count]
+    coverage: Required[float | None]
+    rms_mm: Required[float | None]
+    noise_floor_mm: Required[float | None]
+    radius_mm: Required[float | None]
+
+
+class _Verified(ResultMeta, total=False):
+    """`verify/*`."""
+
+    shape: str
+    incidence: dict[str, Any] | None
+    models: Annotated[dict[str, _VerifiedModel], msgspec.Meta(min_length=1)]
+    centres_mm: dict[str, _Triple]
+    masked: dict[str, Any]
+
+
+class _Pair(TypedDict, total=False):
+    """The registration of two scans."""
+
+    scan: str
+    onto: str
+    rms_mm: Required[float]
+    overlap: Required[float]
+    T_reference_scan: Required[_Matrix4]
+    middle: _Triple
+    sigma_shift_mm: float | None
+    sigma_turn_deg: float | None
+    point_to_point_rms_mm: float | None
+
+
+class _RegisteredPair(_Pair, total=False):
+    """The registration of two scans that are named."""
+
+    scan: Required[str]
+    onto: Required[str]
+
+
+class _Loop(TypedDict):
+    """A loop of registered pairs."""
+
+    scans: list[str]
+    error_mm: float
+    error_deg: float
+    left_mm: float
+    left_deg: float
+
+
+class _Refused(TypedDict):
+    """Two scans that were not registered, or whose registration was dropped."""
+
+    scan: str
+    onto: str
+    why: str
+
+
+class _Merge(ResultMeta, total=False):
+    """`merge/*`."""
+
+    reference: str
+    scans: list[str]
+    pairs: dict[str, _Pair]
+    points: _Count
+    ply: str
+    model: str
+    scale: str
+    registered: list[_RegisteredPair]
+    loops: list[_Loop]
+    dropped: list[_Refused]
+    refused: list[_Refused]
+    left_out: dict[str, dict[str, _Count]]
+    shared: float | None
+
+
+class _MeasurementData(TypedDict, total=False):
+    """The entries of a measurement's data that several readers use."""
+
+    quantities: list[dict[str, Any]]
+    scale: float | None
+    feature: dict[str, Any]
+    scatter: list[Any]
+    calibration: str
+    fit: dict[str, Any]
+    plane: dict[str, Any]
+    where: str
+    between: list[str]
+
+
+class _Measurement(ResultMeta, total=False):
+    """`measurements/*`."""
+
+    kind: str
+    name: str
+    source: str
+    model: str
+    time: str
+    data: _MeasurementData
+    of: list[str]
+
+
+class _DriftCheck(TypedDict):
+    """The entries of a drift check that are no figures."""
+
+    time: str
+    calibration: str
+
+
+class _Drift(ResultMeta, total=False):
+    """`drift/*`."""
+
+    checked: _DriftCheck
+
+
+class _Acceptance(ResultMeta, total=False):
+    """`acceptance/*`."""
+
+    accepted: dict[str, Any]
+    time: str
+
+
+class _Scale(ResultMeta, total=False):
+    """`scale/*`."""
+
+    factor: Annotated[float, msgspec.Meta(gt=0.5, lt=2)]
+    U_ppm: Annotated[float, msgspec.Meta(ge=0, lt=1e6)]
+    certificate: str
+
+
+_Decisions = TypedDict(
+    "_Decisions",
+    {
+        "excluded": dict[str, str] | None,
+        "names": dict[str, str] | None,
+        "measurement names": dict[str, str] | None,
+        "model": str | None,
+        "target": str | None,
+        "patterns": str | None,
+        "levels": list[Annotated[int, msgspec.Meta(ge=0, le=255)]] | None,
+        "exposures": list[_Exposure] | None,
+        "exposure": dict[Literal["exposure_ms", "gain"], float | None] | None,
+        "sigma_wanted_mm": Annotated[float, msgspec.Meta(ge=0, lt=1e6)] | None,
+        "rig": dict[str, Any] | None,
+        "use_anyway": str | None,
+    },
+    total=False,
+)
+
+
+_TYPES: dict[str, Any] = {
+    "calibration/stereo": _Stereo,
+    "calibration/pixelwise": _Fitted,
+    "calibration/splined": _Fitted,
+    "calibration/verdict": _Verdict,
+    "calibration/validation": _Validation,
+    "compiled/splined": _Compiled,
+    "poses": _Pose,
+    "evidence": _Evidence,
+    "trust": _FrameCheck,
+    "clouds": _Cloud,
+    "verify": _Verified,
+    "merge": _Merge,
+    "measurements": _Measurement,
+    "drift": _Drift,
+    "acceptance": _Acceptance,
+    "scale": _Scale,
+}
+
+
+def check_meta(name: str, meta: Mapping[str, Any]) -> None:
+    """Raise InputError, which names the entry, unless ``meta`` is what a result of this name holds."""
+    from_plain(meta, _TYPES.get(name) or _TYPES.get(name.partition("/")[0]) or ResultMeta)
+
+
+def read_decisions(path: Path) -> dict[str, Any]:
+    """Return the decisions in a file, each of its type; none where it is missing, DamagedError where it is damaged."""
+    if not path.exists():
+        return {}
+    decisions = read_json(path)
+    with decoding(path):
+        from_plain(decisions, _Decisions)
+    return decisions

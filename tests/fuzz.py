@@ -1,0 +1,480 @@
+"""Malformed input of every kind: `python -m tests.fuzz --minutes 10`, or `--count 2000 --seed 1`.
+
+Each case damages one file of a small session, or one that a command reads, runs one command on it in a forked child
+within 10 s and 2 GB, and is counted by its outcome. Right are: a refusal (exit status 1 to 3 and one printable message,
+the session unchanged), and success, where the damage does not matter to the command.
+"""
+
+import argparse
+import contextlib
+import json
+import os
+import random
+import re
+import resource
+import shutil
+import signal
+import sys
+import tempfile
+import time
+import traceback
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from slviewer import cli
+from slviewer.calibration.diagnosis.verdict import Verdict
+from slviewer.calibration.stereo import StereoModel
+from slviewer.fringe.presets import phase_steps
+from slviewer.fringe.sequence import Frame, PatternSequence
+from slviewer.geometry.lens import Lens
+from slviewer.geometry.rig import StereoRig
+from slviewer.session.ply import write_ply
+from slviewer.session.store import Session
+from slviewer.simulation.assets import asset_folder
+
+SECONDS, MEGABYTES = 10.0, 2048
+EVIL_TEXT = "a\x1b[2J\u202eb\x00c"
+VALUES: tuple[Any, ...] = (
+    None, True, 0, -1, 1, 3, 0.5, 1e308, -1e308, float("nan"), float("inf"), float("-inf"), 10**9, 10**30, -(2**63),
+    "", "x", "1e30", EVIL_TEXT, "x" * 5000, "../../etc/passwd", "~nobody/x", [], {}, [[]], [1], [None], {"a": 1},
+    {EVIL_TEXT: EVIL_TEXT}, [1, 2, 3, 4], [[1, 2], [3]], ["x"], ["x", "y"], {"x": {}}, [{}], [float("nan")] * 3,
+)  # fmt: skip
+COMMANDS = {
+    "session": (
+        "inspect S", "report S --out r.html", "reconstruct S scan --out c.ply", "decode S pose_1 --out d.npz",
+        "measurements S", "measurements S --csv m.csv", "export S calibration --out e", "verify S scan",
+        "check S pose_1", "validate S", "mesh S merge/1 --out m.stl",
+        "merge S scan scan_2 --reference scan --out m.ply",
+        "calibrate S --target circles:7x5:9", "measure S scan point --at 3 3", "compare S scan part.stl",
+        "import opencv-calibration calibration.json S --force", "preflight --capture S scan",
+    ),
+    "rig": ("capture S new --rig rig.toml --port 0", "preflight --rig rig.toml --port 0"),
+    "frames": ("import frames images S --toml frames.toml",),
+    "image": ("import frames images S --toml frames.toml", "detect circles:7x5:9 images/00.png"),
+    "artefact": ("accept S --artefact artefact.toml",),
+    "nominal": ("compare S scan part.stl", "compare S scan part.obj", "compare S scan part_2.ply"),
+}  # fmt: skip
+"""The commands that read the files of a kind, S being the session."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a command ended: the ``kind`` that is counted, and its last message."""
+
+    kind: str
+    message: str
+
+
+def make_seed(folder: Path) -> None:
+    """Make a small session with a result of every kind, and the files that commands read beside it."""
+    sequence = PatternSequence((96, 64), (*phase_steps("x", 4, 96.0), *phase_steps("y", 4, 64.0)))
+    size, rng = (40, 30), np.random.default_rng(0)
+    with Session.create(folder / "S") as store:
+        for name in ("pose_1", "pose_2", "scan", "scan_2"):
+            frames = _render_frames(sequence, size, rng)
+            role: Any = "calibration" if name.startswith("pose") else "scan"
+            store.save_capture(name, role, sequence, frames, source="fuzz", board="circles:7x5:9")
+        K = np.array([[60.0, 0, 20], [0, 60, 15], [0, 0, 1]])
+        Kp = np.array([[140.0, 0, 48], [0, 140, 32], [0, 0, 1]])
+        rig = StereoRig(Lens(K, np.zeros(5), size), Lens(Kp, np.zeros(5), (96, 64)), np.eye(3), np.array([-60.0, 0, 0]))
+        for name, meta in _metas(store, StereoModel.from_rig(rig).to_dict()).items():
+            point = np.linspace(0, 1, 1200, dtype=np.float32).reshape(30, 40)
+            cloud = {"points": np.dstack([point, point, point + 500]), "sigma_z": point, "phase": point}
+            arrays = {**cloud, "modulation": point, "texture": np.zeros((30, 40), np.uint8)}
+            store.save_result(name, meta, arrays if name.startswith("clouds/") else {})
+        write_ply(store.exports / "merged_1.ply", rng.random((50, 3)), faces=rng.integers(0, 50, (40, 3)))
+        store.decide("excluded", {"pose_2": "blurred"})
+        store.decide("target", "circles:7x5:9")
+    (folder / "images").mkdir()
+    for index, frame in enumerate(_render_frames(sequence, size, rng)):
+        cv2.imwrite(str(folder / "images" / f"{index:02d}.png"), frame)
+    tables = [
+        f'[[frame]]\nfile = "{i:02d}.png"\n'
+        + "".join(f"{key} = {json.dumps(v)}\n" for key, v in frame.to_dict().items())
+        for i, frame in enumerate(sequence.frames)
+    ]
+    (folder / "frames.toml").write_text('projector = "96x64"\nphase_sign = 1\n' + "\n".join(tables))
+    for source, target in (("rigs/simulated.toml", "rig.toml"), ("artefacts/sphere_196.toml", "artefact.toml")):
+        kind, name = source.split("/")
+        shutil.copy(asset_folder(kind) / name, folder / target)
+    matrices = {"K_camera": K, "D_camera": np.zeros(5), "K_projector": Kp, "D_projector": np.zeros(5)}
+    matrices |= {"R": np.eye(3), "T": np.array([-60.0, 0, 0])}
+    (folder / "calibration.json").write_text(json.dumps({name: value.tolist() for name, value in matrices.items()}))
+    _write_cube(folder)
+
+
+def _metas(store: Session, model: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """Return {result: its meta}, one or more of every kind, each after its inputs."""
+    pose = {"inputs": store.input_hashes("pose_1")}
+    scan = {"inputs": store.input_hashes("scan")}
+    pair = {"rms_mm": 0.1, "overlap": 0.5, "T_reference_scan": np.eye(4).tolist()}
+    quantity = {"name": "x", "value": 1.0, "unit": "mm"}
+    place = [0.0, 0.0, 500.0]
+    figures = {"points": 9, "set_aside": 1, "coverage": 0.5, "rms_mm": 0.1, "noise_floor_mm": 0.1, "radius_mm": None}
+    axis = {"period_px": 18.0, "steps": 4, "readable": 1.0, "saturated": 0.0, "harmonic": 0.0, "period_seen_px": 18.0}
+    return {
+        "calibration/stereo": {"model": model, "settings": {"smoothing": "spline", "degree": 3}, **pose},
+        "calibration/verdict": {"verdict": Verdict().to_json(), **pose},
+        "poses/pose_1": {"target": "circles:7x5:9", "smoothing": ["spline"], "reading": 1, "refused": "dark", **pose},
+        "evidence/pose_1": {
+            "target": "circles:7x5:9",
+            "look": 3,
+            "evidence": {"name": "pose_1", "refused": "", "grid": None, "axes": {"x": axis}, "moved_px": None},
+            **pose,
+        },
+        "trust/pose_1": {"version": 1, "axes": [], "contradictions": [], **pose},
+        "clouds/scan": {"model": "stereo", "axis": "x", "points": 1200, "scales": {"stereo": 1.0}, **scan},
+        "verify/scan": {
+            "shape": "plane", "incidence": None, "models": {"stereo": figures}, "centres_mm": {}, "masked": {}, **scan
+        },
+        "merge/1": {
+            "reference": "scan", "scans": ["scan", "scan_2"], "pairs": {"scan_2": pair}, "points": 50,
+            "ply": "merged_1.ply", "model": "stereo", "scale": "", "scales": {"stereo": 1.0}, **scan,
+        },
+        "measurements/m1": {
+            "kind": "point", "name": "corner", "source": "scan", "model": "stereo", "time": "2026-01-01", "of": [],
+            "data": {"quantities": [quantity], "feature": {"kind": "point", "place": place}, "scale": 1.0}, **scan,
+        },
+        "drift/1": {"checked": {"time": "2026-01-01", "calibration": "0", "capture": "pose_1"}, **pose},
+        "acceptance/1": {"accepted": {"decision": "pass"}, "time": "2026-01-01", **scan},
+        "scale/stereo": {"factor": 1.0, "U_ppm": 10.0, "certificate": "c", **scan},
+    }  # fmt: skip
+
+
+def _render_frames(sequence: PatternSequence, size: tuple[int, int], rng: np.random.Generator) -> np.ndarray:
+    """Return frames (n, h, w) uint8 of a plane that shows every pattern, with noise."""
+    width, height = size
+    v, u = np.mgrid[:height, :width]
+
+    def render(frame: Frame) -> np.ndarray:
+        """Return one frame of phase steps."""
+        place = 20 + u if frame.axis == "x" else 15 + v
+        phase = 2 * np.pi * (place / frame.period_px + frame.step / frame.steps)
+        return 120 + 80 * np.cos(phase) + rng.normal(0, 1, (height, width))
+
+    return np.stack([render(frame) for frame in sequence.frames]).astype(np.uint8)
+
+
+def _write_cube(folder: Path) -> None:
+    """Write a cube as STL, OBJ and PLY."""
+    import trimesh
+
+    box = trimesh.creation.box((20, 20, 20))
+    for name in ("part.stl", "part.obj", "part_2.ply"):
+        box.export(folder / name)
+
+
+# damage
+
+
+def damage_text(text: str, rng: random.Random) -> bytes:
+    """Return a text with the faults that a parser meets."""
+    choices: tuple[Callable[[], bytes], ...] = (
+        lambda: text[: rng.randrange(len(text) + 1)].encode(),
+        lambda: b"",
+        lambda: bytes(rng.randrange(256) for _ in range(200)),
+        lambda: b"\x00" * 500,
+        lambda: b"[" * 100_000,
+        lambda: b'{"a":' * 100_000,
+        lambda: b"a = " + b"[" * 100_000,
+        lambda: b"a" + b".a" * 100_000 + b" = 1",
+        lambda: (text + "9" * 5000).encode(),
+        lambda: re.sub(r"\d+", lambda m: "9" * 5000 if rng.random() < 0.2 else m[0], text).encode(),
+        lambda: re.sub(r"\d+(\.\d+)?", lambda m: rng.choice(NUMBERS) if rng.random() < 0.1 else m[0], text).encode(),
+        lambda: text.replace('"', "", 1).encode(),
+        lambda: _flip(text.encode(), rng),
+        lambda: ("\ufeff" + text).encode("utf-16"),
+        lambda: text.replace("\n", EVIL_TEXT, 1).encode(),
+    )
+    return rng.choice(choices)()
+
+
+NUMBERS = ("inf", "-inf", "nan", "1e400", "1e30", "-1", "0", "1000000000", "99999999999999999999", "[]", "{}", '"x"')
+
+
+def damage_tree(data: Any, rng: random.Random) -> Any:
+    """Return plain values with one of them replaced, removed, repeated or wrapped."""
+    data = json.loads(json.dumps(data))
+    places = list(_walk(data))
+    if not places:
+        return rng.choice(VALUES)
+    inside, key = rng.choice(places)
+    how = rng.random()
+    if how < 0.7:
+        inside[key] = rng.choice(VALUES)
+    elif how < 0.85:
+        del inside[key]
+    elif how < 0.95:
+        inside[key] = [inside[key]] * rng.choice((1, 2, 50_000))
+    elif isinstance(inside, dict):
+        inside[EVIL_TEXT] = inside[key]
+    return data
+
+
+def _walk(data: Any) -> Iterator[tuple[Any, Any]]:
+    """Yield (container, key) of every value in plain values."""
+    for key in data if isinstance(data, dict) else range(len(data)) if isinstance(data, list) else ():
+        yield data, key
+        yield from _walk(data[key])
+
+
+def damage_array(path: Path, rng: random.Random) -> None:
+    """Replace a .npy file by another array, or a damaged one."""
+    array = np.load(path)
+    others = (
+        array.ravel()[:-1], array.astype(np.float64) * np.nan, np.zeros(0), np.zeros((3, 4)), array[None],
+        np.float64(1),
+        np.array(["x", "y"]), np.full(array.shape, 1e308), np.zeros(array.shape, bool),
+    )  # fmt: skip
+    header = b"\x93NUMPY\x01\x00v\x00{'descr': '<f8', 'fortran_order': False, 'shape': (%s,), }" % rng.choice(
+        (b"99999999999", b"-1", b"1e9", b"9" * 40)
+    )
+    path.unlink()
+    if rng.random() < 0.6:
+        np.save(path, rng.choice(others))
+    else:
+        path.write_bytes(rng.choice((header.ljust(127) + b"\n", b"", b"PK\x03\x04" + b"0" * 99, b"\x80\x04}\x94.")))
+
+
+def damage_bytes(data: bytes, rng: random.Random) -> bytes:
+    """Return bytes cut short, flipped, repeated or filled with zeros."""
+    choices: tuple[Callable[[], bytes], ...] = (
+        lambda: data[: rng.randrange(len(data) + 1)],
+        lambda: _flip(data, rng),
+        lambda: _flip(data[:120], rng) + data[120:],
+        lambda: data * 3,
+        lambda: b"",
+        lambda: data[: len(data) // 2] + bytes(len(data) // 4) + data[3 * len(data) // 4 :],
+    )
+    return rng.choice(choices)()
+
+
+def damage_mesh(path: Path, rng: random.Random) -> bytes:
+    """Return a nominal model that is damaged, or larger than it seems."""
+    facet = b"facet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\nendfacet\n"
+    record = np.zeros(50, np.uint8).tobytes()
+    one = np.array([0, 0, 1, 0, 0, 0, 9, 0, 0, 0, 9, 0], "<f4").tobytes() + b"\0\0"
+    count = rng.choice((20_000, 1_000_000))
+    apart = np.zeros(count, np.dtype([("v", "<f4", 12), ("a", "u1", 2)]))
+    apart["v"] = np.random.default_rng(0).random((count, 12), np.float32) * 100
+    bombs: dict[str, tuple[Callable[[], bytes], ...]] = {
+        ".stl": (
+            lambda: bytes(80) + count.to_bytes(4, "little") + one * count,
+            lambda: bytes(80) + count.to_bytes(4, "little") + apart.tobytes(),
+            lambda: bytes(80) + (2**32 - 1).to_bytes(4, "little") + record,
+            lambda: b"".join(b"solid s%d\n" % i + facet + b"endsolid\n" for i in range(30_000)),
+            lambda: b"solid x\n" + facet * 100_000,
+            lambda: b"solid x\nfacet normal nan nan inf\nouter loop\nvertex 1e400 0 0\n",
+        ),
+        ".obj": (
+            lambda: b"v 0 0 0\nv 1 0 0\nv 0 1 0\n" + b"".join(b"g g%d\nf 1 2 3\n" % i for i in range(100_000)),
+            lambda: b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 99999999\nf -1 -2 -9\n",
+            lambda: b"v 0 0 0\nf " + b"1 " * 300_000,
+            lambda: b"mtllib /etc/passwd\nusemtl x\nv 1e400 nan 0\nf 1 1 1\n",
+        ),
+        ".ply": (
+            lambda: b"ply\nformat ascii 1.0\nelement vertex 999999999999\nproperty float x\nend_header\n",
+            lambda: b"ply\nformat binary_little_endian 1.0\nelement face -1\nproperty list int int v\nend_header\n",
+            lambda: b"ply\nelement\nproperty\nend_header\n",
+        ),
+    }
+    return rng.choice((*bombs[path.suffix], lambda: damage_bytes(path.read_bytes(), rng)))()
+
+
+def damage_image(path: Path, rng: random.Random) -> bytes:
+    """Return an image that is damaged, or much larger than the others."""
+    image = cv2.imread(str(path))
+    if rng.random() < 0.5:
+        return damage_bytes(path.read_bytes(), rng)
+    shape, suffix = rng.choice(((20000, 20000), (1, 1), (31, 40), (1, 100_000))), rng.choice((".png", ".jpg", ".bmp"))
+    if suffix == ".bmp" or shape[0] * shape[1] < 1e8:
+        shape = (31, 40) if shape[0] == 20000 else shape
+    kinds = (np.zeros(shape, np.uint8), np.dstack([image] * 2)[..., :4], image.astype(np.uint16) * 257)
+    return cv2.imencode(".png" if suffix == ".bmp" else suffix, rng.choice(kinds))[1].tobytes()
+
+
+def _flip(data: bytes, rng: random.Random) -> bytes:
+    """Return bytes with a few of them replaced."""
+    flipped = bytearray(data)
+    for _ in range(min(len(data), rng.choice((1, 5, 50)))):
+        flipped[rng.randrange(len(data))] = rng.randrange(256)
+    return bytes(flipped)
+
+
+def damage(folder: Path, rng: random.Random) -> tuple[str, str]:
+    """Damage one file in a copy of the seed; returns what was done and the command to run."""
+    kind = rng.choice(("session",) * 6 + ("rig", "frames", "image", "artefact", "nominal"))
+    command = rng.choice(COMMANDS[kind])
+    names = {"rig": "rig.toml", "frames": "frames.toml", "artefact": "artefact.toml"}
+    if kind == "session":
+        files = [path for path in (folder / "S").rglob("*") if path.is_file() and not path.name.startswith(".lock")]
+        texts = [path for path in files if path.suffix == ".json"]
+        path = rng.choice(texts if rng.random() < 0.7 else files)
+    elif kind == "image":
+        path = folder / "images" / "00.png"
+    else:
+        path = folder / (names.get(kind) or next(w for w in command.split() if w.startswith("part")))
+    how = _damage_file(path, rng)
+    return f"{path.relative_to(folder)}: {how}", command
+
+
+def _damage_file(path: Path, rng: random.Random) -> str:
+    """Damage a file, and return how."""
+    if rng.random() < 0.08:
+        return _replace_by_node(path, rng)
+    if path.suffix == ".npy":
+        damage_array(path, rng)
+        return "array"
+    if path.suffix in (".stl", ".obj", ".ply") and "S" not in path.parts:
+        content, how = damage_mesh(path, rng), "mesh"
+    elif path.suffix == ".png" and path.parent.name == "images":
+        content, how = damage_image(path, rng), "image"
+    elif path.suffix == ".json" and rng.random() < 0.75:
+        content, how = json.dumps(damage_tree(json.loads(path.read_text()), rng)).encode(), "values"
+    elif path.suffix in (".json", ".toml"):
+        content, how = damage_text(path.read_text(), rng), "text"
+    else:
+        content, how = damage_bytes(path.read_bytes(), rng), "bytes"
+    path.unlink()  # it may be a link of the seed's
+    path.write_bytes(content)
+    return how
+
+
+def _replace_by_node(path: Path, rng: random.Random) -> str:
+    """Replace a file by something that is none, or has no end."""
+    path.unlink()
+    how = rng.choice(("pipe", "/dev/zero", "folder", "sparse", "missing", "circle"))
+    if how == "pipe":
+        os.mkfifo(path)
+    elif how == "/dev/zero":
+        path.symlink_to("/dev/zero")
+    elif how == "folder":
+        path.mkdir()
+    elif how == "sparse":
+        with path.open("wb") as file:
+            file.truncate(3 << 30)
+    elif how == "circle":
+        path.symlink_to(path.name)
+    return how
+
+
+# running
+
+
+def run_case(folder: Path, command: str) -> Outcome:
+    """Run a command in a forked child within the limits, and return how it ended."""
+    before, out = describe_tree(folder / "S"), folder / "output"
+    child = os.fork()
+    if not child:
+        _run_child(folder, command, out)
+    end, status = time.monotonic() + SECONDS, None
+    while status is None and time.monotonic() < end:
+        done, code = os.waitpid(child, os.WNOHANG)
+        status = code if done else None
+        time.sleep(0.005)
+    if status is None:
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+        return Outcome("hang", "")
+    text = out.read_text(errors="replace") if out.exists() else ""
+    message = text.strip().splitlines()[-1] if text.strip() else ""
+    if os.WIFSIGNALED(status):
+        return Outcome("crash", f"signal {os.WTERMSIG(status)} {message}")
+    code = os.WEXITSTATUS(status)
+    if "Traceback (most recent call last)" in text or "unexpected" in message:
+        where = re.findall(r'File ".*?(slviewer/.*?)", line (\d+)', text)
+        kind = "memory" if "MemoryError" in text else "traceback"
+        return Outcome(kind, f"{message} at {':'.join(where[-1]) if where else '?'}")
+    if any(not (c.isprintable() or c in "\n\t\r") for c in text):
+        return Outcome("control characters", repr(message))
+    if code == 0:
+        return Outcome("no effect", "")
+    if code not in (1, 2, 3) or not message:
+        return Outcome("wrong status", f"{code}: {message}")
+    if describe_tree(folder / "S") != before:
+        return Outcome("session changed", message)
+    return Outcome("refused", message)
+
+
+def _run_child(folder: Path, command: str, out: Path) -> None:
+    """Run the command in this process, within the limits, and end it."""
+    descriptor = os.open(out, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+    os.dup2(descriptor, 1)
+    os.dup2(descriptor, 2)
+    resource.setrlimit(resource.RLIMIT_DATA, (MEGABYTES << 20, MEGABYTES << 20))
+    os.chdir(folder)
+    status = 99
+    try:
+        status = cli.main(command.split())
+        sys.stdout.flush()
+    except BaseException:
+        traceback.print_exc()
+    finally:
+        sys.stderr.flush()
+        os._exit(status)
+
+
+def describe_tree(folder: Path) -> dict[str, tuple[int, ...]]:
+    """Return {file: what changes when it is written} of all files in a session but those of its lock."""
+    described = {}
+    for parent, _, files in os.walk(folder):
+        for name in files:
+            if not name.startswith(".lock"):
+                status = Path(parent, name).lstat()
+                described[str(Path(parent, name))] = (status.st_ino, status.st_size, status.st_mtime_ns)
+    return described
+
+
+def main() -> int:
+    """Run cases, and print their number by outcome, and an example of each that is wrong."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--minutes", type=float, default=float("inf"))
+    parser.add_argument("--count", type=int, default=None)
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args()
+    count = options.count or (2000 if options.minutes == float("inf") else 10**9)
+    end = time.monotonic() + 60 * options.minutes
+    outcomes: Counter[str] = Counter()
+    wrong: Counter[tuple[str, str, str]] = Counter()
+    with tempfile.TemporaryDirectory() as root:
+        seed, folder = Path(root, "seed"), Path(root, "case")
+        seed.mkdir()
+        make_seed(seed)
+        _warm_up(seed, folder)
+        for number in range(count):
+            if time.monotonic() > end:
+                break
+            shutil.copytree(seed, folder, copy_function=os.link)
+            how, command = damage(folder, random.Random(f"{options.seed}-{number}"))
+            outcome = run_case(folder, command)
+            outcomes[outcome.kind] += 1
+            if outcome.kind not in ("refused", "no effect"):
+                wrong[outcome.kind, command.split()[0], re.sub(r"0x\w+|/tmp/\S+", "", outcome.message)[:160]] += 1
+                print(f"{number}: {outcome.kind}: {command} ({how}): {outcome.message[:300]}", flush=True)
+            shutil.rmtree(folder)
+    print(f"\n{sum(outcomes.values())} cases: " + ", ".join(f"{n} {kind}" for kind, n in outcomes.most_common()))
+    return int(bool(wrong))
+
+
+def _warm_up(seed: Path, folder: Path) -> None:
+    """Run every command on the sound seed, so that kernels are compiled, and print those that fail."""
+    global SECONDS
+    limit, SECONDS = SECONDS, 300.0
+    for command in dict.fromkeys(command for commands in COMMANDS.values() for command in commands):
+        shutil.copytree(seed, folder, copy_function=os.link)
+        outcome = run_case(folder, command)
+        if outcome.kind != "no effect":
+            print(f"sound: {command}: {outcome.kind}: {outcome.message[:300]}", flush=True)
+        shutil.rmtree(folder)
+    SECONDS = limit
+
+
+if __name__ == "__main__":
+    with contextlib.suppress(KeyboardInterrupt):
+        sys.exit(main())
