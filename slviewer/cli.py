@@ -165,6 +165,12 @@ def main(arguments: list[str] | None = None) -> int:
         return Cancelled.exit_status
     except BrokenPipeError:
         return 1
+    except (MemoryError, RecursionError) as error:
+        reason = "needs more memory than there is" if isinstance(error, MemoryError) else "nests values too deep"
+        terminal.print_message(
+            f"slviewer: an unexpected end: what was read {reason}: give a smaller or an undamaged file"
+        )
+        return 1
     except OSError as error:
         where = f" ({error.filename})" if error.filename else ""
         terminal.print_message(f"slviewer: {error.strerror or error}{where}")

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from slviewer import terminal
 from slviewer.commands.command import JSON, Option, call, write_json
 from slviewer.errors import UsageError
 
@@ -39,11 +40,11 @@ def run_calibrate(calibrate: Callable[..., Any], arguments: dict[str, Any]) -> N
     else:
         result = call(calibrate, **arguments)
     data = result.to_json()
-    print(result.text())
+    terminal.print_result(result.text())
     if validated and not camera_only:
         from slviewer.pipeline.validate import validate
 
         compared = call(validate, session=arguments["session"], models=arguments["models"])
         data["validation"] = compared.to_json()
-        print(compared.text())
+        terminal.print_result(compared.text())
     write_json(json_file, data)

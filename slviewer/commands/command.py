@@ -108,9 +108,10 @@ def show_result(
     result = call(function, **arguments)
     write_json(json_file, result.to_json() if hasattr(result, "to_json") else result)
     if describe is not None:
-        print(describe(result, **arguments))
+        text = describe(result, **arguments)
     else:
-        print(result if isinstance(result, str) else result.text())
+        text = result if isinstance(result, str) else result.text()
+    terminal.print_result(text)
     if failure := getattr(result, "failure", ""):
         raise SlviewerError(failure)
 

@@ -38,7 +38,7 @@ def run_capture(capture: Callable[..., Any], arguments: dict[str, Any]) -> None:
 
     with _serve_projector_page(arguments.pop("port")) as set_up:
         saved = call(capture, set_up=set_up, **arguments)
-    print(summarise_capture(saved))
+    terminal.print_result(summarise_capture(saved))
 
 
 def run_preflight(check_rig: Callable[..., Any], arguments: dict[str, Any]) -> None:
@@ -54,7 +54,7 @@ def run_preflight(check_rig: Callable[..., Any], arguments: dict[str, Any]) -> N
         with _serve_projector_page(port) as set_up:
             checked = call(check_rig, set_up=set_up, **arguments)
     write_json(json_file, checked.to_dict())
-    print(checked.text())
+    terminal.print_result(checked.text())
     if checked.verdict == "bad":
         if recorded is not None:
             raise InputError("the capture is not fit to measure with: correct what is marked bad, then capture again")

@@ -5,6 +5,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
+from slviewer import terminal
 from slviewer.commands.command import Option, Run, call, read_command, union
 from slviewer.errors import InputError, UsageError
 
@@ -43,9 +44,9 @@ def run_import(layout: str, import_captures: Callable[..., Any], arguments: dict
         from slviewer.pipeline.import_captures import detect_layout
 
         layout = detect_layout(arguments["source"])
-        print(f"layout {layout}")
+        terminal.print_result(f"layout {layout}")
     names = call(import_captures, layout=layout, **arguments)
-    print(f"{len(names)} capture{'s' * (len(names) != 1)} imported: {', '.join(names)}")
+    terminal.print_result(f"{len(names)} capture{'s' * (len(names) != 1)} imported: {', '.join(names)}")
 
 
 def run_frames(import_captures: Callable[..., Any], arguments: dict[str, Any]) -> None:
@@ -70,13 +71,17 @@ def run_import_calibration(import_calibration: Callable[..., Any], arguments: di
 
     if arguments["keys"] is None:
         identified = identify_calibration_keys(arguments["file"])
-        print("read from the file: " + ", ".join(f"{entry} = {key}" for entry, key in identified.items()))
+        terminal.print_result(
+            "read from the file: " + ", ".join(f"{entry} = {key}" for entry, key in identified.items())
+        )
     model = call(import_calibration, **arguments)
     if model is None:
-        print("stereo calibration imported; import the scans that it belongs to")
+        terminal.print_result("stereo calibration imported; import the scans that it belongs to")
         return
     (cw, ch), (pw, ph) = model.rig.camera.size, model.rig.projector.size
-    print(f"stereo calibration imported: camera {cw}x{ch}, projector {pw}x{ph}, baseline {model.baseline_mm:.1f} mm")
+    terminal.print_result(
+        f"stereo calibration imported: camera {cw}x{ch}, projector {pw}x{ph}, baseline {model.baseline_mm:.1f} mm"
+    )
 
 
 def _propose_description(folder: Path, out: Path | None, projector: str | None, channel: str | None) -> None:
@@ -89,7 +94,7 @@ def _propose_description(folder: Path, out: Path | None, projector: str | None, 
     else:
         out.parent.mkdir(parents=True, exist_ok=True)
         out.write_text(guessed.toml, encoding="utf-8")
-        print(f"written to {out}")
+        terminal.print_result(f"written to {out}")
     if guessed.doubts:
         raise InputError(f"unsure: {'; '.join(guessed.doubts)}. Correct the entries marked UNSURE in the TOML")
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from slviewer.errors import InputError
-from slviewer.session.names import natural_key
+from slviewer.session.names import clean_label, natural_key
 from slviewer.session.store import Session
 
 FOLDER = "measurements"
@@ -52,7 +52,7 @@ def save_measurement(
     used = dict(inputs) | store.input_hashes(*(_result_name(store, each) for each in of))
     meta = {
         "kind": kind,
-        "name": name.strip(),
+        "name": clean_label(name),
         "source": source,
         "model": model,
         "time": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -100,7 +100,7 @@ def measurement_arrays(store: Session, identity: str) -> dict[str, np.ndarray]:
 def rename_measurement(store: Session, identity: str, name: str) -> Measurement:
     """Give a measurement another name; an empty one restores its original name."""
     _result_name(store, identity)
-    store.decide(NAMES, {**(store.decision(NAMES) or {}), identity: name.strip()})
+    store.decide(NAMES, {**(store.decision(NAMES) or {}), identity: clean_label(name)})
     return load_measurement(store, identity)
 
 

@@ -31,6 +31,15 @@ def safe_path(name: str) -> str:
     return name
 
 
+def clean_label(text: str) -> str:
+    """Return an operator's name for something, without surplus space. Raises InputError for characters that are not
+    printable: controls, and marks that change the direction of writing."""
+    label = " ".join(text.split())
+    if not label.isprintable():
+        raise InputError(f"{label!r} holds characters that cannot be printed: type the name again")
+    return label
+
+
 def natural_key(name: str) -> list[tuple[int, int, str]]:
     """Sort key that puts `pose_2` before `pose_10`."""
     parts = re.split(r"(\d+)", name.lower())

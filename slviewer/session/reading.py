@@ -24,6 +24,7 @@ MAX_CLOUD_BYTES = 1 << 31
 MAX_DEPTH = 32
 _MAX_INTEGER = 1 << 63
 _LONE_SURROGATE = re.compile("[\ud800-\udfff]")
+_DEEP_KEY = re.compile(r"""(?<![\w"'-])(?:(?:[\w-]+|"[^"\n]*"|'[^'\n]*')[ \t]*\.[ \t]*){32}""")
 _INVALID = (KeyError, TypeError, ValueError, AttributeError, IndexError, ArithmeticError, RecursionError, MemoryError)
 """What a decoder raises that meets a value that it does not expect."""
 
@@ -66,7 +67,10 @@ def read_toml(path: Path | str) -> dict[str, Any]:
     """The tables of a TOML file. Raises InputError where it cannot be read, with the reason."""
     path = expand_user(path)
     try:
-        data: dict[str, Any] = _check_values(tomllib.loads(read_file(path, MAX_TOML_BYTES).decode()))
+        text = read_file(path, MAX_TOML_BYTES).decode()
+        if _DEEP_KEY.search(text):  # which would take the parser hours
+            raise ValueError(f"nested more than {MAX_DEPTH} deep")
+        data: dict[str, Any] = _check_values(tomllib.loads(text))
     except OSError as error:
         raise InputError(f"{path} cannot be read ({_reason(error)}): give the TOML file that is needed here") from error
     except (ValueError, RecursionError, MemoryError) as error:

@@ -157,8 +157,6 @@ class _Verified(ResultMeta, total=False):
 class _Pair(TypedDict, total=False):
     """The registration of two scans."""
 
-    scan: str
-    onto: str
     rms_mm: Required[float]
     overlap: Required[float]
     T_reference_scan: Required[_Matrix4]

@@ -12,6 +12,7 @@ from slviewer.fringe.sequence import Axis, PatternSequence, one_axis
 from slviewer.geometry.rig import StereoRig
 from slviewer.pipeline.capture import choose_sequence, save_frames
 from slviewer.session.atomic import format_bytes
+from slviewer.session.names import clean_label
 from slviewer.wizard.acquisition import CaptureRequest
 from slviewer.wizard.engine import Engine
 from slviewer.wizard.requests import request
@@ -128,7 +129,7 @@ class CaptureRequests(ResultRequests):
         """Store the operator's label of a capture, unless it is blank."""
         store = self._engine.store
         if label.strip():
-            store.decide("names", {**(store.decision("names") or {}), name: label.strip()})
+            store.decide("names", {**(store.decision("names") or {}), name: clean_label(label)})
 
     def _check_space(self, name: str, frames: int) -> None:
         """Raise SessionError where so many frames would fill the disk."""

@@ -8,6 +8,7 @@ from slviewer.pipeline.calibrate import CalibrationResult
 from slviewer.pipeline.export import FORMATS, What, check_export
 from slviewer.pipeline.models import accept_rejected_calibration, accepts_rejected, available_models, check_accepted
 from slviewer.pipeline.verify import Shape
+from slviewer.session.names import clean_label
 from slviewer.surface.meshing import MeshingPlan
 from slviewer.wizard import diagnostics, tasks
 from slviewer.wizard.export_files import export_file
@@ -47,7 +48,7 @@ class ResultRequests(RequestHandler):
         """Set the label of a capture, any text; its files keep their name."""
         store = self._engine.store
         store.load_capture(name)
-        store.decide("names", {**(store.decision("names") or {}), name: label.strip() or name})
+        store.decide("names", {**(store.decision("names") or {}), name: clean_label(label) or name})
 
     @request("Calibrating")
     def calibrate(self) -> None:
