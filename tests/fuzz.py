@@ -48,15 +48,16 @@ VALUES: tuple[Any, ...] = (
 COMMANDS = {
     "session": (
         "inspect S", "report S --out r.html", "reconstruct S scan --out c.ply", "decode S pose_1 --out d.npz",
-        "measurements S", "measurements S --csv m.csv", "export S calibration --out e", "verify S scan",
+        "measurements S", "measurements S --csv m.csv", "export S calibration --out e.json",
+        "verify S scan --shape plane",
         "check S pose_1", "validate S", "mesh S merge/1 --out m.stl",
         "merge S scan scan_2 --reference scan --out m.ply",
         "calibrate S --target circles:7x5:9", "measure S scan point --at 3 3", "compare S scan part.stl",
         "import opencv-calibration calibration.json S --force", "preflight --capture S scan",
     ),
     "rig": ("capture S new --rig rig.toml --port 0", "preflight --rig rig.toml --port 0"),
-    "frames": ("import frames images S --toml frames.toml",),
-    "image": ("import frames images S --toml frames.toml", "detect circles:7x5:9 images/00.png"),
+    "frames": ("import frames images S2 --sequence frames.toml",),
+    "image": ("import frames images S2 --sequence frames.toml", "detect images/00.png --target circles:7x5:9"),
     "artefact": ("accept S --artefact artefact.toml",),
     "nominal": ("compare S scan part.stl", "compare S scan part.obj", "compare S scan part_2.ply"),
 }  # fmt: skip
@@ -373,7 +374,7 @@ def run_case(folder: Path, command: str) -> Outcome:
     child = os.fork()
     if not child:
         _run_child(folder, command, out)
-    end, status = time.monotonic() + SECONDS, None
+    end, status = time.monotonic() + 6 * SECONDS, None  # it may be busy: the time used is limited
     while status is None and time.monotonic() < end:
         done, code = os.waitpid(child, os.WNOHANG)
         status = code if done else None
@@ -384,6 +385,8 @@ def run_case(folder: Path, command: str) -> Outcome:
         return Outcome("hang", "")
     text = out.read_text(errors="replace") if out.exists() else ""
     message = text.strip().splitlines()[-1] if text.strip() else ""
+    if os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGXCPU:
+        return Outcome("hang", "")
     if os.WIFSIGNALED(status):
         return Outcome("crash", f"signal {os.WTERMSIG(status)} {message}")
     code = os.WEXITSTATUS(status)
@@ -407,6 +410,7 @@ def _run_child(folder: Path, command: str, out: Path) -> None:
     descriptor = os.open(out, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
     os.dup2(descriptor, 1)
     os.dup2(descriptor, 2)
+    resource.setrlimit(resource.RLIMIT_CPU, (int(SECONDS), int(SECONDS) + 1))
     resource.setrlimit(resource.RLIMIT_DATA, (MEGABYTES << 20, MEGABYTES << 20))
     os.chdir(folder)
     status = 99
@@ -439,7 +443,6 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     count = options.count or (2000 if options.minutes == float("inf") else 10**9)
-    end = time.monotonic() + 60 * options.minutes
     outcomes: Counter[str] = Counter()
     wrong: Counter[tuple[str, str, str]] = Counter()
     with tempfile.TemporaryDirectory() as root:
@@ -447,6 +450,7 @@ def main() -> int:
         seed.mkdir()
         make_seed(seed)
         _warm_up(seed, folder)
+        end = time.monotonic() + 60 * options.minutes
         for number in range(count):
             if time.monotonic() > end:
                 break
