@@ -126,6 +126,7 @@ COMMANDS = Commands(
         ),
         "report": partial(read_command, "pipeline.report:report", "session"),
         "inspect": partial(read_command, "pipeline.inspect:inspect", "session"),
+        "restore": partial(read_command, "pipeline.restore:restore", "session", "names"),
         "bench": partial(read_command, "validation.bench:bench", options=[JSON]),
     }
 )

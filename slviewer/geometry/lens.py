@@ -8,6 +8,12 @@ import numpy as np
 from slviewer.errors import InputError
 from slviewer.geometry.brown import distort_all, fold_radius_squared, project_all, undistort_all
 
+FOCAL_PX = 1.0, 1e7
+"""Focal lengths that a lens may have; the principal point is as near to the image as the longest."""
+LARGEST_PX = 100_000
+LARGEST_DISTORTION = 1e9
+"""Of k3 of a telephoto lens, which multiplies the sixth power of a small angle."""
+
 
 @dataclass(frozen=True, eq=False)
 class Lens:
@@ -46,8 +52,20 @@ class Lens:
             )
         D = np.concatenate([D, np.zeros(5 - D.size)])
         width, height = (int(n) for n in self.size)
-        if width < 1 or height < 1:
-            raise InputError(f"An image of {width}x{height} px was given: its size is width x height, both positive.")
+        if not (1 <= width <= LARGEST_PX and 1 <= height <= LARGEST_PX):
+            raise InputError(
+                f"An image of {width}x{height} px was given: its size is width x height, 1 to {LARGEST_PX} px each."
+            )
+        low, high = FOCAL_PX
+        if not (low <= K[0, 0] <= high and low <= K[1, 1] <= high) or np.abs(K[:2, 2]).max() > high:
+            raise InputError(
+                f"The focal lengths {K[0, 0]:.6g} and {K[1, 1]:.6g} px and the principal point ({K[0, 2]:.6g}, "
+                f"{K[1, 2]:.6g}) px belong to no lens (focal lengths are {low:g} to {high:g} px): give K in pixels."
+            )
+        if np.abs(D).max() > LARGEST_DISTORTION:
+            raise InputError(
+                f"The distortion coefficients {D.tolist()} belong to no lens: check them, or calibrate again."
+            )
         K.setflags(write=False)
         D.setflags(write=False)
         object.__setattr__(self, "K", K)

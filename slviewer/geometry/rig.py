@@ -8,6 +8,8 @@ from slviewer.errors import InputError
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.rigid import rigid_transform
 
+LARGEST_BASELINE_MM = 1e6
+
 
 @dataclass(frozen=True, eq=False)
 class StereoRig:
@@ -30,6 +32,11 @@ class StereoRig:
             )
         if t.shape != (3,) or not np.isfinite(t).all():
             raise InputError(f"The translation from camera to projector must be 3 numbers in mm, not {t.tolist()}.")
+        if not np.linalg.norm(t) <= LARGEST_BASELINE_MM:
+            raise InputError(
+                f"Camera and projector are {np.linalg.norm(t):.3g} mm apart: give the translation in mm, "
+                f"{LARGEST_BASELINE_MM:g} at most."
+            )
         R.setflags(write=False)
         t.setflags(write=False)
         object.__setattr__(self, "R", R)

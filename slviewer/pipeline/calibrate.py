@@ -29,6 +29,7 @@ from slviewer.pipeline.models import (
     preferred_model,
     save_fitted,
     save_stereo,
+    trash_models,
     warn_if_frame_changed,
 )
 from slviewer.pipeline.open_session import SessionLike, match_names, opened, opened_or_made
@@ -174,18 +175,19 @@ def calibrate(
         stereo = diagnosed.stereo
         settings = {"target": str(board), "smoothing": smoothing, "degree": degree, "models": list(models)}
         if diagnosed.verdict.level == "rejected":
-            save_rejected(store, stereo, settings, diagnosed.verdict)
-            save_verdict(store, diagnosed.verdict, names)
+            save_rejected(store, stereo, settings, diagnosed.verdict, names)
             raise rejection_error(diagnosed.verdict, is_saved=True)
         result = _fit_models(diagnosed, models, part(progress, 0.66, 0.97), warn, excluded_poses)
         if result.verdict.level == "rejected":
-            save_rejected(store, stereo, settings, result.verdict)
-            save_verdict(store, result.verdict, names)
+            save_rejected(store, stereo, settings, result.verdict, names)
             raise rejection_error(result.verdict, is_saved=True)
         progress(0.97, "saving")
         inputs = store.input_hashes(*stereo.poses)
-        _save_models(store, result, inputs, settings)
-        save_verdict(store, result.verdict, names)
+        with store.together():
+            if _changes_calibration(store, inputs, settings):  # what is not made anew would be of another calibration
+                trash_models(store, [name for name in available_models(store) if getattr(result, name) is None])
+            _save_models(store, result, inputs, settings)
+            save_verdict(store, result.verdict, names)
         warn_if_frame_changed(store, before, warn)
         progress(1.0, "calibrated")
     return result
@@ -231,10 +233,18 @@ def calibrate_frames(
 def save_calibration(session: SessionLike, result: CalibrationResult) -> None:
     """Save the models of ``result`` in a session, which is created where there is none; those that it held before are
     moved to its trash."""
-    with opened_or_made(session) as store:
-        for name in available_models(store):
-            store.trash_result(f"calibration/{name}")
+    with opened_or_made(session) as store, store.together():
+        trash_models(store, available_models(store))
         _save_models(store, result, {}, {})
+
+
+def _changes_calibration(store: Session, inputs: Mapping[str, str], settings: Mapping[str, Any]) -> bool:
+    """Return whether the session's models belong to a calibration from other captures or settings, if any."""
+    if "stereo" not in available_models(store):
+        return True
+    meta = store.load_result("calibration/stereo", only=())[0]
+    before, now = ({**each, "models": ()} for each in (meta.get("settings", {}), settings))
+    return meta["inputs"] != dict(inputs) or before != now
 
 
 def _save_models(

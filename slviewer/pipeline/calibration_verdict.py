@@ -14,7 +14,7 @@ from slviewer.errors import CalibrationRejected, InputError
 from slviewer.fringe.layout import axis_layout
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.pipeline.feedback import Progress
-from slviewer.pipeline.models import VERDICT, available_models, save_stereo
+from slviewer.pipeline.models import VERDICT, available_models, save_stereo, trash_models
 from slviewer.pipeline.poses import Judged, read_stored_poses
 from slviewer.records import from_plain
 from slviewer.session.store import Session
@@ -75,11 +75,14 @@ def describe_period_conflict(sequence: PatternSequence) -> str:
     return ""
 
 
-def save_rejected(store: Session, stereo: StereoModel, settings: Mapping[str, Any], verdict: Verdict) -> None:
-    """Save a rejected calibration for inspection; the models of earlier poses are moved to the trash."""
-    for name in available_models(store):
-        store.trash_result(f"calibration/{name}")
-    save_stereo(store, stereo, store.input_hashes(*stereo.poses), settings, verdict)
+def save_rejected(
+    store: Session, stereo: StereoModel, settings: Mapping[str, Any], verdict: Verdict, poses: Sequence[str]
+) -> None:
+    """Save a rejected calibration from these poses for inspection; the models before it are moved to the trash."""
+    with store.together():
+        trash_models(store, available_models(store))
+        save_stereo(store, stereo, store.input_hashes(*stereo.poses), settings, verdict)
+        save_verdict(store, verdict, poses)
 
 
 def save_verdict(store: Session, verdict: Verdict, poses: Sequence[str]) -> None:

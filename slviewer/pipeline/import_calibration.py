@@ -13,7 +13,7 @@ from slviewer.geometry.lens import Lens
 from slviewer.geometry.rig import StereoRig
 from slviewer.pipeline.capture_phases import decode_capture
 from slviewer.pipeline.feedback import Warn, ignore_warnings
-from slviewer.pipeline.models import available_models, load_stereo, save_imported_stereo
+from slviewer.pipeline.models import available_models, load_stereo, save_imported_stereo, trash_models
 from slviewer.pipeline.open_session import opened_or_made
 from slviewer.reconstruction.axis_agreement import check_phases
 from slviewer.session.importers import opencv_calibration
@@ -67,6 +67,8 @@ def import_opencv_calibration(
                 path, "projector", projector, stated, {capture.sequence.projector_size for capture in captures} - {None}
             ),
         }
+        for device, size in sizes.items():  # raises what a lens cannot have
+            Lens(matrices[f"K_{device}"], matrices[f"D_{device}"], size or (1, 1))
         witnessed = _is_confirmed_by_captures(store, matrices, sizes, warn)
         for device, size in sizes.items():
             if size is not None and not witnessed:
@@ -150,12 +152,7 @@ def _replace_calibration(
     source: str,
     sizes: dict[str, tuple[int, int] | None],
 ) -> None:
-    """Save the calibration in place of those that are there; where saving fails, these come back."""
-    for name in there:
-        store.trash_result(f"calibration/{name}")
-    try:
+    """Save the calibration in place of those that are there, in one step."""
+    with store.together():
+        trash_models(store, there)
         save_imported_stereo(store, matrices, source=source, camera=sizes["camera"], projector=sizes["projector"])
-    except BaseException:
-        for name in there:
-            store.restore_result(f"calibration/{name}")
-        raise

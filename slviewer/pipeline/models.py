@@ -1,7 +1,7 @@
 """Calibrations in a session: saving, loading, choosing, and noticing when one is stale."""
 
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from typing import Any
 
@@ -72,6 +72,12 @@ def save_fitted(
 def available_models(store: Session) -> tuple[str, ...]:
     """Names of the calibrations that the session holds."""
     return tuple(name for name in MODELS if store.has_result(f"calibration/{name}"))
+
+
+def trash_models(store: Session, names: Iterable[str]) -> None:
+    """Move calibrations to the session's trash."""
+    for name in names:
+        store.trash_result(f"calibration/{name}")
 
 
 def save_imported_stereo(

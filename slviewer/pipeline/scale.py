@@ -6,9 +6,13 @@ from typing import Any
 
 import numpy as np
 
+from slviewer.errors import InputError
 from slviewer.evaluation.acceptance.result import Acceptance
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.session.store import Session
+
+LARGEST_FACTOR = 1.25
+"""Of a scale correction: a larger one means another artefact, unit or target."""
 
 
 def load_scale_correction(store: Session, model: str) -> dict[str, Any] | None:
@@ -65,6 +69,11 @@ def record_scale(store: Session, acceptance: Acceptance) -> float:
     assert acceptance.scale is not None
     before = scale_factor(store, acceptance.model)
     factor = before / (1 + 1e-6 * acceptance.scale.ppm)
+    if not 1 / LARGEST_FACTOR <= factor <= LARGEST_FACTOR:  # False for NaN
+        raise InputError(
+            f"the scale factor would be {factor:.6g}, which is no correction (at most {LARGEST_FACTOR:g}): check the "
+            "certificate's length, temperature and expansion, and that its captures show this artefact"
+        )
     calibration = f"calibration/{acceptance.model}"
     meta = {
         "factor": factor,

@@ -4,7 +4,8 @@ A folder is written as `.<name>.tmp-<pid>-<random>` next to its place, every fil
 replaces another it is first renamed to `.<name>.new-<pid>-<random>`: from then on the replacement is decided, and
 `recover` finishes it if the program dies between moving the old folder away and moving the new one in. A folder that
 waits for others to be renamed with it is called `.<name>.done-<pid>-<random>`: it is complete, and `recover` renames it
-too.
+too. Folders that replace others in one step are listed in a file `.together.new-<pid>-<random>`: once it exists, all of
+these replacements are decided.
 """
 
 import errno
@@ -13,7 +14,7 @@ import os
 import re
 import secrets
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -22,6 +23,7 @@ from slviewer.errors import SessionError
 from slviewer.records import to_plain
 
 _LEFTOVER = re.compile(r"\.(?P<name>.+)\.(?P<state>tmp|done|new)-\d+-[0-9a-f]+")
+_TOGETHER = "together"
 _SPARE_BYTES = 1 << 20  # metadata, folders, the file system's own rounding
 
 
@@ -139,6 +141,53 @@ def commit(folder: Path, target: Path, old_to: Path | None = None) -> None:
         sync_folder(target.parent)
 
 
+def commit_together(
+    root: Path, changes: Mapping[Path, tuple[Path | None, Path | None]], *, discarded: bool = True
+) -> None:
+    """Replace several folders under ``root`` in one step, which `recover` finishes if the program dies meanwhile.
+
+    ``changes``: {target: (the staged folder to rename to it, None to leave none there; the place to move the present
+    one to, None to delete it)}. Raises SessionError where the disk refuses: nothing is changed then, and the staged
+    folders are removed where ``discarded``; or, where it refuses half-way, the next opening of the session finishes it.
+    """
+    listed = [
+        [None if path is None else path.relative_to(root).as_posix() for path in (target, staged, old_to)]
+        for target, (staged, old_to) in changes.items()
+    ]
+    temporary = _staging_path(root / _TOGETHER, "tmp")
+    decided = _staging_path(root / _TOGETHER, "new")
+    try:
+        with _disk_errors(root):
+            write_bytes(temporary, to_json({"changes": listed}))
+            os.replace(temporary, decided)
+    except BaseException:
+        discard(temporary)
+        for staged, _ in changes.values():
+            if discarded and staged is not None:
+                discard(staged)
+        raise
+    _finish_together(decided)
+
+
+def _finish_together(decided: Path) -> None:
+    """Make the changes that a file of `commit_together` lists, those that were not made yet, and remove the file."""
+    root = decided.parent
+    with _disk_errors(root):
+        sync_folder(root)
+        for names in read_json(decided)["changes"]:
+            target, staged, old_to = (None if name is None else root / name for name in names)
+            assert target is not None
+            is_waiting = staged is not None and staged.exists()
+            if target.exists() and (is_waiting or staged is None):
+                _move_away(target, old_to)
+                sync_folder(target.parent)
+            if staged is not None and is_waiting:
+                os.rename(staged, target)
+                sync_folder(target.parent)
+        decided.unlink()
+        sync_folder(root)
+
+
 def move(folder: Path, target: Path) -> None:
     """Rename a folder within the session and make that durable."""
     with disk_errors(target.parent):
@@ -174,6 +223,9 @@ def recover(root: Path, trash_place: Callable[[Path], Path]) -> list[Path]:
     disk refuses.
     """
     completed = []
+    for path in list_leftovers(root):
+        if path.parent == root and path.name.startswith(f".{_TOGETHER}.new-"):
+            _finish_together(path)
     for path in list_leftovers(root):
         match = _LEFTOVER.fullmatch(path.name)
         if not match or match["state"] == "tmp":

@@ -112,10 +112,10 @@ def trash_measurement(store: Session, identity: str) -> None:
 def restore_measurement(store: Session, identity: str = "") -> Measurement:
     """Bring a deleted measurement back, by default the last one deleted. Raises InputError where there is none."""
     if not identity:
-        deleted = [each for each in store.deleted_results() if each.startswith(f"{FOLDER}-")]
+        deleted = [each for each in store.deleted_results() if each.startswith(f"{FOLDER}/")]
         if not deleted:
             raise InputError("no measurement was deleted, so none can be restored: measure again")
-        identity = deleted[0].removeprefix(f"{FOLDER}-")
+        identity = deleted[0].removeprefix(f"{FOLDER}/")
     store.restore_result(f"{FOLDER}/{identity}")
     return load_measurement(store, identity)
 
@@ -128,7 +128,7 @@ def _list_ids(store: Session) -> list[str]:
 
 def _list_trashed_numbers(store: Session) -> list[int]:
     """Numbers of deleted measurements, which may be restored and are not used again."""
-    numbers = [each.removeprefix(f"{FOLDER}-m") for each in store.deleted_results() if each.startswith(f"{FOLDER}-m")]
+    numbers = [each.removeprefix(f"{FOLDER}/m") for each in store.deleted_results() if each.startswith(f"{FOLDER}/m")]
     return [int(number) for number in numbers if number.isdecimal()]
 
 

@@ -2,8 +2,8 @@
 
 import contextlib
 import threading
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from datetime import UTC, datetime
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -27,6 +27,7 @@ from slviewer.session.names import is_safe_name, natural_key, safe_name, safe_pa
 from slviewer.session.reading import expand_user
 from slviewer.session.result_types import read_decisions
 from slviewer.session.results import check_place, check_result, list_results, read_arrays, read_meta, write_result
+from slviewer.session.trash import Trashed, list_trash, trash_place
 
 _CREATION_ATTEMPTS = 5
 _MAX_INPUTS_CHAIN = 32
@@ -47,6 +48,7 @@ class Session:
         self._decisions_lock = threading.Lock()
         self._allow: Callable[[], None] | None = None
         self._created: Literal["", "session", "folder"] = ""  # what this object made
+        self._together: dict[Path, tuple[Path | None, Path | None]] | None = None  # as `atomic.commit_together` takes
         self.recovered: tuple[str, ...] = ()  # captures that a writer died before it could finish, completed on opening
 
     # opening and closing
@@ -241,23 +243,68 @@ class Session:
 
     def deleted_captures(self, role: Role | None = None) -> list[str]:
         """Names of the captures in the trash that `restore_capture` can bring back, the last deleted first."""
-        names = []
-        for name, place in self._restorable().items():
-            with contextlib.suppress(DamagedError):
-                if role is None or read_capture(place).role == role:
-                    names.append(name)
+        names = list[str]()
+        for each in self.trashed():
+            if each.is_capture and each.name not in names and not self._capture_folder(each.name).exists():
+                with contextlib.suppress(DamagedError):
+                    if role is None or read_capture(each.place).role == role:
+                        names.append(each.name)
         return names
 
     def restore_capture(self, name: str) -> Capture:
         """Bring the last deleted capture of that name back. InputError where there is none, or the name is in use."""
-        self._require_writer()
-        place = self._restorable().get(name)
-        if place is None:
+        found = next((each for each in self.trashed() if each.name == name and each.is_capture), None)
+        if found is None or self._capture_folder(name).exists():
             raise InputError(f"no deleted capture {name!r} can be brought back: another may have its name now")
-        atomic.move(place, self._capture_folder(name))
+        self.restore([found])
         return self.load_capture(name)
 
+    def trashed(self) -> list[Trashed]:
+        """Return what is in the trash and complete, the last deleted first."""
+        return list_trash(self.folder / "trash")
+
+    def restore(self, entries: Iterable[Trashed]) -> None:
+        """Bring captures and results back from the trash, in one step; what has their names now takes their places."""
+        self._require_writer()
+        changes = dict[Path, tuple[Path | None, Path | None]]()
+        for each in entries:
+            target = self._capture_folder(each.name) if each.is_capture else self._result_folder(each.name)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            changes[target] = each.place, self._trash_place_of(target)
+        atomic.commit_together(self.folder, changes, discarded=False)
+
     # results
+
+    @contextmanager
+    def together(self) -> Iterator[None]:
+        """Context manager: results that are saved or moved to the trash in it change in one step, at its end.
+
+        Where it raises, or the program dies or the disk refuses before the end, all stay as they were. Within it this
+        session already reads the new ones. For one thread.
+        """
+        if self._together is not None:  # part of a larger step
+            yield
+            return
+        self._require_writer()
+        changes = self._together = {}
+        try:
+            yield
+            self._require_writer()
+        except BaseException:
+            for staged, _ in changes.values():
+                if staged is not None:
+                    atomic.discard(staged)
+            raise
+        finally:
+            self._together = None
+        if changes:
+            atomic.commit_together(self.folder, changes)
+
+    def _result_folder(self, name: str) -> Path:
+        """Return the folder of a result, where `together` has staged it; InputError for an unsafe name."""
+        target = self.folder / "results" / safe_path(name)
+        staged, _ = (self._together or {}).get(target, (target, None))
+        return target.with_name(f".{target.name}.absent") if staged is None else staged
 
     def result_names(self) -> list[str]:
         """Names of the results, such as `calibration/stereo`, sorted."""
@@ -265,7 +312,7 @@ class Session:
 
     def has_result(self, name: str) -> bool:
         """Whether there is a result of that name, fresh or stale: `state_of` reads all that it was made from."""
-        return (self.folder / "results" / safe_path(name) / "meta.json").is_file()
+        return (self._result_folder(name) / "meta.json").is_file()
 
     def save_result(self, name: str, meta: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> None:
         """Save a result; it replaces one of that name in one step, which stays if this fails.
@@ -280,7 +327,13 @@ class Session:
         with atomic.staged_folder(target, size) as staged:
             write_result(staged, meta, checked)
             self._require_writer()
-        atomic.commit(staged, target)
+        if self._together is None:
+            atomic.commit(staged, target)
+            return
+        replaced, old_to = self._together.get(target, (None, None))
+        self._together[target] = staged, old_to
+        if replaced is not None:
+            atomic.discard(replaced)
 
     def load_result(
         self, name: str, only: Collection[str] | None = None
@@ -289,7 +342,7 @@ class Session:
 
         Raises InputError where there is no such result, SessionError where it is damaged.
         """
-        folder = self.folder / "results" / safe_path(name)
+        folder = self._result_folder(name)
         if not (folder / "meta.json").is_file():
             there = ", ".join(self.result_names()) or "none"
             raise InputError(f"there is no result {name!r} in {self.folder}: the results are {there}")
@@ -299,26 +352,26 @@ class Session:
         """Move a result to the trash folder; returns its place there."""
         self._require_writer()
         self.load_result(name, only=())
-        target = self._trash_place(name.replace("/", "-"))
-        atomic.move(self.folder / "results" / name, target)
+        folder, target = self.folder / "results" / name, self._trash_place(name)
+        if self._together is None:
+            atomic.move(folder, target)
+            return target
+        staged, old_to = self._together.get(folder, (None, None))
+        self._together[folder] = None, old_to or target
+        if staged is not None:
+            atomic.discard(staged)
         return target
 
     def deleted_results(self) -> list[str]:
-        """Names of the results in the trash, the slashes in them dashes, the last deleted first."""
-        trash = self.folder / "trash"
-        places = [place for place in trash.glob("*-*") if (place / "meta.json").is_file()] if trash.is_dir() else []
-        places.sort(key=lambda place: place.name.rpartition("-")[2], reverse=True)
-        return list(dict.fromkeys(place.name.rpartition("-")[0] for place in places))
+        """Names of the results in the trash, the last deleted first."""
+        return list(dict.fromkeys(each.name for each in self.trashed() if not each.is_capture))
 
     def restore_result(self, name: str) -> None:
         """Bring the last deleted result of that name back. InputError where there is none, or the name is in use."""
-        self._require_writer()
-        target = self.folder / "results" / safe_path(name)
-        stem = name.replace("/", "-")
-        places = [p for p in (self.folder / "trash").glob(f"{stem}-*") if p.name.rpartition("-")[0] == stem]
-        if target.exists() or not places:
+        found = next((each for each in self.trashed() if each.name == name and not each.is_capture), None)
+        if found is None or self._result_folder(name).exists():
             raise InputError(f"no deleted result {name!r} can be brought back: another may have its name now")
-        atomic.move(max(places, key=lambda place: place.name), target)
+        self.restore([found])
 
     def input_hashes(self, *names: str) -> dict[str, str]:
         """Return {name: content hash} of captures and results, for `meta["inputs"]`. Raises InputError where absent."""
@@ -339,7 +392,7 @@ class Session:
 
     def _state_of(self, name: str, known: dict[str, State], depth: int) -> State:
         """Return the state of a result ``depth`` inputs away; ``known``: states of those that were met before."""
-        folder = self.folder / "results" / safe_path(name)
+        folder = self._result_folder(name)
         if name in known or not (folder / "meta.json").is_file():
             return known.get(name, "absent")
         inputs, known[name] = read_meta(folder).get("inputs", {}), "stale"  # while it is examined, or if that fails
@@ -465,28 +518,18 @@ class Session:
 
     def _trash_place(self, name: str) -> Path:
         """Return a new path in the trash, with the time of deletion behind the name."""
-        return self.folder / "trash" / f"{name}-{datetime.now(UTC).strftime('%Y%m%dT%H%M%S%f')}"
+        return trash_place(self.folder / "trash", name)
 
     def _trash_place_of(self, folder: Path) -> Path:
         """Return a new path in the trash for the folder of a capture or result."""
         parts = folder.relative_to(self.folder).parts
         return self._trash_place("-".join(parts[1:]) or parts[0])
 
-    def _restorable(self) -> dict[str, Path]:
-        """{name: the place in the trash of its latest version} of captures whose names are free, the latest first."""
-        trash, latest = self.folder / "trash", dict[str, Path]()
-        places = [place for place in trash.glob("*-*") if (place / "capture.json").is_file()] if trash.is_dir() else []
-        for place in sorted(places, key=lambda place: place.name.rpartition("-")[2], reverse=True):
-            name = place.name.rpartition("-")[0]
-            if not self._capture_folder(name).exists():
-                latest.setdefault(name, place)
-        return latest
-
     def _hashes(self, name: str) -> list[str]:
         """Content hashes of the capture and of the result of that name, where there are any."""
         is_capture = "/" not in name and self._has_description(name)
         content_hashes = [self.load_capture(name).hash] if is_capture else []
-        folder = self.folder / "results" / safe_path(name)
+        folder = self._result_folder(name)
         if (folder / "meta.json").is_file():
             content_hashes.append(str(read_meta(folder).get("hash")))
         return content_hashes

@@ -195,7 +195,7 @@ class SessionReader:
             merge=merges[-1] if merges else None,
             merges=len(merges),
             measurements=self._attempt("the measurements", lambda: self._read_measurements(inputs), ()),
-            deleted_measurements=sum(name.startswith(f"{MEASUREMENTS}-") for name in session.deleted_results()),
+            deleted_measurements=sum(name.startswith(f"{MEASUREMENTS}/") for name in session.deleted_results()),
             nominals=list_nominals(session.folder),
             exports=list_exports(session),
             exposures_ms=self.exposures_ms(),

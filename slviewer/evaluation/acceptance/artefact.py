@@ -18,6 +18,8 @@ _KEYS = {
     "measured": {"temperature_C", "temperature_U_K", "captures"},
     "limits": {"form_mm", "size_mm", "spacing_mm", "flatness_mm"},
 }  # fmt: skip
+_MOST = {"_mm": 1e5, "_ppm_K": 1e4, "_C": 1e3, "_K": 1e3}
+"""The largest value that a certificate may state, by the end of its name."""
 
 
 @dataclass(frozen=True)
@@ -146,10 +148,11 @@ class Artefact:
 
 
 def _number(table: Mapping[str, Any], key: str, otherwise: float | None = None, least: float | None = None) -> float:
-    """The number at ``key``, above 0 or at least ``least``."""
+    """The number at ``key``, above 0 or at least ``least``, and at most what `_MOST` says of its unit."""
     value = table.get(key, otherwise)
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise InputError(f"the artefact's file says {key} = {value!r}: give a number, as its certificate does")
-    if not (value > 0 if least is None else value >= least):
+    most = next(most for unit, most in _MOST.items() if key.endswith(unit))
+    if not ((value > 0 if least is None else value >= least) and value <= most):
         raise InputError(f"the artefact's file says {key} = {value:g}, which is impossible: check unit and sign")
     return float(value)
