@@ -14,7 +14,7 @@ import os
 import re
 import secrets
 import shutil
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -141,38 +141,64 @@ def commit(folder: Path, target: Path, old_to: Path | None = None) -> None:
         sync_folder(target.parent)
 
 
-def commit_together(
-    root: Path, changes: Mapping[Path, tuple[Path | None, Path | None]], *, discarded: bool = True
-) -> None:
-    """Replace several folders under ``root`` in one step, which `recover` finishes if the program dies meanwhile.
+class Together:
+    """Folders under ``root`` that replace others in one step; `recover` finishes it if the program dies meanwhile."""
 
-    ``changes``: {target: (the staged folder to rename to it, None to leave none there; the place to move the present
-    one to, None to delete it)}. Raises SessionError where the disk refuses: nothing is changed then, and the staged
-    folders are removed where ``discarded``; or, where it refuses half-way, the next opening of the session finishes it.
-    """
-    listed = [
-        [None if path is None else path.relative_to(root).as_posix() for path in (target, staged, old_to)]
-        for target, (staged, old_to) in changes.items()
-    ]
-    temporary = _staging_path(root / _TOGETHER, "tmp")
-    decided = _staging_path(root / _TOGETHER, "new")
-    try:
-        with _disk_errors(root):
-            write_bytes(temporary, to_json({"changes": listed}))
-            os.replace(temporary, decided)
-    except BaseException:
-        discard(temporary)
-        for staged, _ in changes.values():
-            if discarded and staged is not None:
+    def __init__(self, root: Path) -> None:
+        self._root = root
+        self._changes: dict[Path, tuple[Path | None, Path | None]] = {}  # target: (what replaces it, where it goes)
+
+    def replace(self, target: Path, folder: Path, old_to: Path | None = None) -> None:
+        """Let a folder, staged or from the trash, become ``target``, whose present one goes to ``old_to`` or is
+        deleted."""
+        replaced, first_to = self._changes.get(target, (None, None))
+        self._changes[target] = folder, first_to or old_to
+        if replaced is not None:
+            discard(replaced)
+
+    def move_away(self, target: Path, old_to: Path) -> None:
+        """Let ``target`` go to ``old_to``; a folder staged for it is removed."""
+        replaced, first_to = self._changes.get(target, (None, None))
+        self._changes[target] = None, first_to or old_to
+        if replaced is not None:
+            discard(replaced)
+
+    def folder_for(self, target: Path) -> Path:
+        """Return where the content of ``target`` is now: a path that does not exist where it is to go."""
+        staged, _ = self._changes.get(target, (target, None))
+        return target.with_name(f".{target.name}.absent") if staged is None else staged
+
+    def discard(self) -> None:
+        """Remove what was staged."""
+        for staged, _ in self._changes.values():
+            if staged is not None and _LEFTOVER.fullmatch(staged.name):
                 discard(staged)
-        raise
-    _finish_together(decided)
+
+    def commit(self) -> None:
+        """Make the changes. Raises SessionError where the disk refuses: nothing is changed then, and what was staged is
+        removed; or, where it refuses half-way, the next opening of the session finishes it."""
+        if not self._changes:
+            return
+        listed = [
+            [None if path is None else path.relative_to(self._root).as_posix() for path in (target, staged, old_to)]
+            for target, (staged, old_to) in self._changes.items()
+        ]
+        temporary, decided = (_staging_path(self._root / _TOGETHER, state) for state in ("tmp", "new"))
+        try:
+            with disk_errors(self._root):
+                write_bytes(temporary, to_json({"changes": listed}))
+                os.replace(temporary, decided)
+        except BaseException:
+            discard(temporary)
+            self.discard()
+            raise
+        _finish_together(decided)
 
 
 def _finish_together(decided: Path) -> None:
-    """Make the changes that a file of `commit_together` lists, those that were not made yet, and remove the file."""
+    """Make the changes that a file of `Together` lists, those that were not made yet, and remove the file."""
     root = decided.parent
-    with _disk_errors(root):
+    with disk_errors(root):
         sync_folder(root)
         for names in read_json(decided)["changes"]:
             target, staged, old_to = (None if name is None else root / name for name in names)

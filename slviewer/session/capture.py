@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import lru_cache
@@ -17,6 +17,7 @@ from slviewer.fringe.hdr import choose_exposure, chosen, merge_exposures, peaks,
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.records import from_plain
 from slviewer.session.atomic import to_json, write_bytes, write_json
+from slviewer.session.names import is_safe_name
 from slviewer.session.reading import decoding, read_json
 from slviewer.session.stack import (
     check_frames,
@@ -215,6 +216,26 @@ def write_capture(folder: Path, capture: NewCapture, role: Role, board: str | No
             "sequence": described,
         },
     )
+
+
+def read_captures(folders: Iterable[Path]) -> tuple[list[Capture], dict[str, str]]:
+    """The captures in these folders, and of every other {its name: what is wrong with it, and the remedy}."""
+    captures, faults = [], {}
+    for folder in folders:
+        if not is_safe_name(folder.name):
+            faults[folder.name] = (
+                f"{folder} is not read: rename it, with letters, digits, '_', '-' and '.', or move it away"
+            )
+        elif not (folder / "capture.json").is_file():
+            faults[folder.name] = (
+                f"{folder} is no capture (it holds no capture.json): restore the file, or move it away"
+            )
+        else:
+            try:
+                captures.append(read_capture(folder))
+            except SessionError as error:
+                faults[folder.name] = str(error)
+    return captures, faults
 
 
 def read_capture(folder: Path) -> Capture:

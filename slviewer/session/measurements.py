@@ -116,7 +116,7 @@ def restore_measurement(store: Session, identity: str = "") -> Measurement:
         if not deleted:
             raise InputError("no measurement was deleted, so none can be restored: measure again")
         identity = deleted[0].removeprefix(f"{FOLDER}/")
-    store.restore_result(f"{FOLDER}/{identity}")
+    store.restore_last(f"{FOLDER}/{identity}")
     return load_measurement(store, identity)
 
 

@@ -19,6 +19,7 @@ from slviewer.session.capture import (
     Role,
     compare_captures,
     read_capture,
+    read_captures,
     write_capture,
 )
 from slviewer.session.layout import create_layout, inner_folders, is_session, new_folder, remove_layout, session_folder
@@ -29,7 +30,6 @@ from slviewer.session.result_types import read_decisions
 from slviewer.session.results import check_place, check_result, list_results, read_arrays, read_meta, write_result
 from slviewer.session.trash import Trashed, list_trash, trash_place
 
-_CREATION_ATTEMPTS = 5
 _MAX_INPUTS_CHAIN = 32
 
 State = Literal["absent", "fresh", "stale"]
@@ -48,7 +48,7 @@ class Session:
         self._decisions_lock = threading.Lock()
         self._allow: Callable[[], None] | None = None
         self._created: Literal["", "session", "folder"] = ""  # what this object made
-        self._together: dict[Path, tuple[Path | None, Path | None]] | None = None  # as `atomic.commit_together` takes
+        self._together: atomic.Together | None = None
         self.recovered: tuple[str, ...] = ()  # captures that a writer died before it could finish, completed on opening
 
     # opening and closing
@@ -93,7 +93,7 @@ class Session:
     @classmethod
     def open_or_create(cls, path: str | Path) -> "Session":
         """The session in a folder, open for writing; made where the folder is missing or empty."""
-        for _ in range(_CREATION_ATTEMPTS):  # another process may create or remove it meanwhile
+        for _ in range(5):  # attempts: another process may create or remove it meanwhile
             was_session = is_session(path)
             try:
                 return cls.open(path, write=True) if was_session else cls.create(path)
@@ -151,21 +151,7 @@ class Session:
 
     def read_captures(self) -> tuple[list[Capture], dict[str, str]]:
         """The captures, and of every other folder in their place {name: what is wrong with it, and the remedy}."""
-        captures, faults = [], {}
-        for name in self.taken_names():
-            folder = self.folder / "captures" / name
-            if not is_safe_name(name):
-                faults[name] = (
-                    f"{folder} is not read: rename it, with letters, digits, '_', '-' and '.', or move it away"
-                )
-            elif not self._has_description(name):
-                faults[name] = f"{folder} is no capture (it holds no capture.json): restore the file, or move it away"
-            else:
-                try:
-                    captures.append(read_capture(folder))
-                except SessionError as error:
-                    faults[name] = str(error)
-        return captures, faults
+        return read_captures([self.folder / "captures" / name for name in self.taken_names()])
 
     def compare_capture(self, new: NewCapture, role: Role) -> Comparison:
         """How the capture of the name of `new`, checked, compares with it."""
@@ -230,19 +216,20 @@ class Session:
                 atomic.discard(folder)
             raise
         for name, folder in staged.items():
-            atomic.commit(folder, self._capture_folder(name), self._trash_place(name))
+            target = self._capture_folder(name)
+            atomic.commit(folder, target, self._trash_place(target))
         return [self.load_capture(name) for name in staged]
 
     def trash_capture(self, name: str) -> Path:
         """Move a capture to the trash folder; returns its place there."""
         self._require_writer()
         folder = self.load_capture(name).folder
-        target = self._trash_place(name)
+        target = self._trash_place(folder)
         atomic.move(folder, target)
         return target
 
     def deleted_captures(self, role: Role | None = None) -> list[str]:
-        """Names of the captures in the trash that `restore_capture` can bring back, the last deleted first."""
+        """Names of the captures in the trash that `restore_last` can bring back, the last deleted first."""
         names = list[str]()
         for each in self.trashed():
             if each.is_capture and each.name not in names and not self._capture_folder(each.name).exists():
@@ -251,14 +238,6 @@ class Session:
                         names.append(each.name)
         return names
 
-    def restore_capture(self, name: str) -> Capture:
-        """Bring the last deleted capture of that name back. InputError where there is none, or the name is in use."""
-        found = next((each for each in self.trashed() if each.name == name and each.is_capture), None)
-        if found is None or self._capture_folder(name).exists():
-            raise InputError(f"no deleted capture {name!r} can be brought back: another may have its name now")
-        self.restore([found])
-        return self.load_capture(name)
-
     def trashed(self) -> list[Trashed]:
         """Return what is in the trash and complete, the last deleted first."""
         return list_trash(self.folder / "trash")
@@ -266,12 +245,20 @@ class Session:
     def restore(self, entries: Iterable[Trashed]) -> None:
         """Bring captures and results back from the trash, in one step; what has their names now takes their places."""
         self._require_writer()
-        changes = dict[Path, tuple[Path | None, Path | None]]()
+        changes = atomic.Together(self.folder)
         for each in entries:
             target = self._capture_folder(each.name) if each.is_capture else self._result_folder(each.name)
             target.parent.mkdir(parents=True, exist_ok=True)
-            changes[target] = each.place, self._trash_place_of(target)
-        atomic.commit_together(self.folder, changes, discarded=False)
+            changes.replace(target, each.place, self._trash_place(target))
+        changes.commit()
+
+    def restore_last(self, name: str) -> None:
+        """Bring the last deleted capture or result of that name back. InputError where there is none, or the name is
+        in use."""
+        found = next((each for each in self.trashed() if each.name == name), None)
+        if found is None or (self._result_folder(name) if "/" in name else self._capture_folder(name)).exists():
+            raise InputError(f"no deleted {name!r} can be brought back: another may have its name now")
+        self.restore([found])
 
     # results
 
@@ -286,25 +273,21 @@ class Session:
             yield
             return
         self._require_writer()
-        changes = self._together = {}
+        changes = self._together = atomic.Together(self.folder)
         try:
             yield
             self._require_writer()
         except BaseException:
-            for staged, _ in changes.values():
-                if staged is not None:
-                    atomic.discard(staged)
+            changes.discard()
             raise
         finally:
             self._together = None
-        if changes:
-            atomic.commit_together(self.folder, changes)
+        changes.commit()
 
     def _result_folder(self, name: str) -> Path:
         """Return the folder of a result, where `together` has staged it; InputError for an unsafe name."""
         target = self.folder / "results" / safe_path(name)
-        staged, _ = (self._together or {}).get(target, (target, None))
-        return target.with_name(f".{target.name}.absent") if staged is None else staged
+        return target if self._together is None else self._together.folder_for(target)
 
     def result_names(self) -> list[str]:
         """Names of the results, such as `calibration/stereo`, sorted."""
@@ -329,11 +312,8 @@ class Session:
             self._require_writer()
         if self._together is None:
             atomic.commit(staged, target)
-            return
-        replaced, old_to = self._together.get(target, (None, None))
-        self._together[target] = staged, old_to
-        if replaced is not None:
-            atomic.discard(replaced)
+        else:
+            self._together.replace(target, staged)
 
     def load_result(
         self, name: str, only: Collection[str] | None = None
@@ -352,26 +332,17 @@ class Session:
         """Move a result to the trash folder; returns its place there."""
         self._require_writer()
         self.load_result(name, only=())
-        folder, target = self.folder / "results" / name, self._trash_place(name)
+        folder = self.folder / "results" / name
+        target = self._trash_place(folder)
         if self._together is None:
             atomic.move(folder, target)
-            return target
-        staged, old_to = self._together.get(folder, (None, None))
-        self._together[folder] = None, old_to or target
-        if staged is not None:
-            atomic.discard(staged)
+        else:
+            self._together.move_away(folder, target)
         return target
 
     def deleted_results(self) -> list[str]:
         """Names of the results in the trash, the last deleted first."""
         return list(dict.fromkeys(each.name for each in self.trashed() if not each.is_capture))
-
-    def restore_result(self, name: str) -> None:
-        """Bring the last deleted result of that name back. InputError where there is none, or the name is in use."""
-        found = next((each for each in self.trashed() if each.name == name and not each.is_capture), None)
-        if found is None or self._result_folder(name).exists():
-            raise InputError(f"no deleted result {name!r} can be brought back: another may have its name now")
-        self.restore([found])
 
     def input_hashes(self, *names: str) -> dict[str, str]:
         """Return {name: content hash} of captures and results, for `meta["inputs"]`. Raises InputError where absent."""
@@ -452,10 +423,8 @@ class Session:
     def exports(self) -> Path:
         """The folder of exported files, created where it is missing."""
         folder = self.folder / "exports"
-        try:
+        with atomic.disk_errors(self.folder):
             folder.mkdir(exist_ok=True)
-        except OSError as error:
-            raise SessionError(f"{folder} cannot be made ({error}): check its permissions") from error
         return folder
 
     # inside
@@ -465,7 +434,7 @@ class Session:
 
         def recover() -> None:
             """Complete or remove their files, and remember the captures that were completed."""
-            completed = atomic.recover(self.folder, self._trash_place_of)
+            completed = atomic.recover(self.folder, self._trash_place)
             self.recovered = tuple(path.name for path in completed if path.parent == self.folder / "captures")
 
         if not atomic.list_leftovers(self.folder):
@@ -516,14 +485,10 @@ class Session:
         """Whether the folder of a capture holds its description, sound or not."""
         return (self._capture_folder(name) / "capture.json").is_file()
 
-    def _trash_place(self, name: str) -> Path:
-        """Return a new path in the trash, with the time of deletion behind the name."""
-        return trash_place(self.folder / "trash", name)
-
-    def _trash_place_of(self, folder: Path) -> Path:
-        """Return a new path in the trash for the folder of a capture or result."""
+    def _trash_place(self, folder: Path) -> Path:
+        """Return a new path in the trash for the folder of a capture or result, with the time of deletion."""
         parts = folder.relative_to(self.folder).parts
-        return self._trash_place("-".join(parts[1:]) or parts[0])
+        return trash_place(self.folder / "trash", "-".join(parts[1:]) or parts[0])
 
     def _hashes(self, name: str) -> list[str]:
         """Content hashes of the capture and of the result of that name, where there are any."""

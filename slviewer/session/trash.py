@@ -21,7 +21,7 @@ class Trashed:
 
 def trash_place(trash: Path, name: str) -> Path:
     """Return a new path in the trash for a capture or result of that name."""
-    return trash / f"{name.replace('/', '-')}-{datetime.now(UTC).strftime(_TIME)}"
+    return trash / f"{name}-{datetime.now(UTC).strftime(_TIME)}"
 
 
 def list_trash(trash: Path) -> list[Trashed]:

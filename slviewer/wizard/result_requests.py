@@ -41,7 +41,9 @@ class ResultRequests(RequestHandler):
     @request("Restoring")
     def undelete(self, name: str) -> None:
         """Restore a deleted capture from the trash; its results are computed again."""
-        self._engine.reprocess(self._engine.store.restore_capture(name))
+        store = self._engine.store
+        store.restore_last(name)
+        self._engine.reprocess(store.load_capture(name))
 
     @request("Renaming")
     def rename(self, name: str, label: str) -> None:

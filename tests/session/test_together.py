@@ -110,5 +110,5 @@ def test_a_result_that_is_trashed_and_saved_again_is_in_the_trash_once(folder):
         assert session.load_result(NAMES[0])[0]["age"] == "new"
         assert session.deleted_results() == ["calibration/stereo"]
         session.trash_result(NAMES[0])
-        session.restore_result(NAMES[0])
+        session.restore_last(NAMES[0])
         assert session.load_result(NAMES[0])[0]["age"] == "new"
