@@ -15,12 +15,13 @@ import re
 import secrets
 import shutil
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from slviewer.errors import SessionError
+from slviewer.errors import DamagedError, SessionError
 from slviewer.records import to_plain
+from slviewer.session.reading import decoding, read_json
 
 _LEFTOVER = re.compile(r"\.(?P<name>.+)\.(?P<state>tmp|done|new)-\d+-[0-9a-f]+")
 _TOGETHER = "together"
@@ -200,9 +201,7 @@ def _finish_together(decided: Path) -> None:
     root = decided.parent
     with disk_errors(root):
         sync_folder(root)
-        for names in read_json(decided)["changes"]:
-            target, staged, old_to = (None if name is None else root / name for name in names)
-            assert target is not None
+        for target, staged, old_to in _read_changes(decided):
             is_waiting = staged is not None and staged.exists()
             if target.exists() and (is_waiting or staged is None):
                 _move_away(target, old_to)
@@ -212,6 +211,23 @@ def _finish_together(decided: Path) -> None:
                 sync_folder(target.parent)
         decided.unlink()
         sync_folder(root)
+
+
+def _read_changes(decided: Path) -> list[tuple[Path, Path | None, Path | None]]:
+    """The changes that a file of `Together` lists; DamagedError where it lists anything but paths in its folder."""
+
+    def inside(name: str) -> Path:
+        """Return the path of a name below the file's folder; raises ValueError for others."""
+        path = decided.parent / name
+        if ".." in path.parts or decided.parent not in path.parents:
+            raise ValueError(f"{name} is outside of {decided.parent}")
+        return path
+
+    with decoding(decided):
+        return [
+            (inside(target), staged and inside(staged), old_to and inside(old_to))
+            for target, staged, old_to in read_json(decided)["changes"]
+        ]
 
 
 def move(folder: Path, target: Path) -> None:
@@ -251,7 +267,9 @@ def recover(root: Path, trash_place: Callable[[Path], Path]) -> list[Path]:
     completed = []
     for path in list_leftovers(root):
         if path.parent == root and path.name.startswith(f".{_TOGETHER}.new-"):
-            _finish_together(path)
+            with suppress(DamagedError):
+                _finish_together(path)
+            discard(path)
     for path in list_leftovers(root):
         match = _LEFTOVER.fullmatch(path.name)
         if not match or match["state"] == "tmp":

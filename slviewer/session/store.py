@@ -77,12 +77,10 @@ class Session:
         process is writing to it.
         """
         folder = session_folder(path)
-        lock = WriterLock(folder)
-        if write:
-            lock.acquire()
-        session = cls(folder, lock if write else None)
+        session = cls(folder, WriterLock(folder) if write else None)
         try:
-            if write:
+            if session._lock is not None:
+                session._lock.acquire()
                 session_folder(path)  # its creator may have removed it before the lock was taken
             session._recover()
         except BaseException:
@@ -431,24 +429,17 @@ class Session:
 
     def _recover(self) -> None:
         """Finish what dead writers began; a reader does so only without a writer, in a writable folder."""
-
-        def recover() -> None:
-            """Complete or remove their files, and remember the captures that were completed."""
-            completed = atomic.recover(self.folder, self._trash_place)
-            self.recovered = tuple(path.name for path in completed if path.parent == self.folder / "captures")
-
         if not atomic.list_leftovers(self.folder):
             return
-        if self._lock is not None:
-            recover()
-            return
-        lock = WriterLock(self.folder)
-        with contextlib.suppress(SessionError, OSError):
-            lock.acquire(patience_s=0)
+        lock = WriterLock(self.folder)  # a reader's, for the moment
+        with contextlib.suppress(*((SessionError, OSError) if self._lock is None else ())):
             try:
-                recover()
+                if self._lock is None:
+                    lock.acquire(patience_s=0)
+                completed = atomic.recover(self.folder, self._trash_place)
             finally:
                 lock.release()
+            self.recovered = tuple(path.name for path in completed if path.parent == self.folder / "captures")
 
     @property
     def is_writable(self) -> bool:

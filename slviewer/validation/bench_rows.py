@@ -14,7 +14,7 @@ from slviewer.calibration.splined.model import SplinedModel
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.geometry import cuda_device
 from slviewer.geometry.jit import kernel
-from slviewer.geometry.rigid import move_points, turn_about
+from slviewer.geometry.rigid import Floats, move_points, turn_about
 from slviewer.reconstruction.onepass import LightLevels
 from slviewer.reconstruction.onepass_cuda import CudaPass
 
@@ -198,11 +198,11 @@ def registration_rows() -> list[dict[str, Any]]:
 
     (points, normals), (moved, moved_normals) = _make_relief(0, 0.0), _make_relief(1, 0.037)
     truth = turn_about(np.radians(4.0) * np.array([1.0, 0.5, 2.0]) / 2.29, moved.mean(0), np.array([3.0, -3.0, 2.6]))
-    start = np.linalg.inv(truth)
+    start = np.linalg.inv(truth).astype(np.float64)
     moved, moved_normals = move_points(truth, moved), moved_normals @ truth[:3, :3].T
     count = f"{len(points) / 1e6:.2f} M points"
 
-    def error_um(T: np.ndarray) -> str:
+    def error_um(T: Floats) -> str:
         """State the largest error of an alignment (4, 4) over the scan, in um."""
         few = moved[::997]
         worst = np.linalg.norm(move_points(T, few) - move_points(start, few), axis=1).max()

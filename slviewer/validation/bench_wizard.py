@@ -9,6 +9,7 @@ import threading
 import time
 from collections import Counter
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -168,16 +169,16 @@ def time_wizard(scale: float = 0.5, progress: Progress = ignore_progress) -> lis
             (f"`slviewer validate` on {POSES} poses", 1, "validate", str(session)),
             ("`slviewer --help`", 5, "--help"),
         ):
-            watch.seconds[name].append(median(lambda arguments=arguments: _run_command(*arguments), times, times > 1))
+            watch.seconds[name].append(median(partial(_run_command, *arguments), times, times > 1))
         progress(0.5, "after installation")
         watch.time_after_installation(Path(folder), scale)
     progress(1.0, "measured")
     rows = []
     for stage, limit in LIMITS.items():
-        times = watch.seconds[stage] or [float("nan")]
-        note = f"median of {len(times)}, the longest {1e3 * max(times):.0f} ms" if len(times) > 1 else ""
-        rows.append(row(stage, statistics.median(times), most_s=limit, note=note))
-        if max(times) > limit:  # of every time, not of their median
+        measured = watch.seconds[stage] or [float("nan")]
+        note = f"median of {len(measured)}, the longest {1e3 * max(measured):.0f} ms" if len(measured) > 1 else ""
+        rows.append(row(stage, statistics.median(measured), most_s=limit, note=note))
+        if max(measured) > limit:  # of every time, not of their median
             rows[-1]["holds"] = "no"
     slowest = sorted(lasted, key=lambda each: -each[1])[:_FUNCTIONS]
     rows += [row(f"Autopilot: {act}", seconds) for act, seconds in slowest]

@@ -112,3 +112,13 @@ def test_a_result_that_is_trashed_and_saved_again_is_in_the_trash_once(folder):
         session.trash_result(NAMES[0])
         session.restore_last(NAMES[0])
         assert session.load_result(NAMES[0])[0]["age"] == "new"
+
+
+@pytest.mark.parametrize(
+    "listed", ['{"changes": [["../x", null, "trash/x"]]}', '{"changes": [["/tmp/x", null, null]]}', "{"]
+)
+def test_a_listing_that_names_other_folders_is_ignored(folder, listed):
+    (folder.parent / "x").mkdir()
+    (folder / ".together.new-1-ab").write_text(listed)
+    assert age(folder) == "old"
+    assert (folder.parent / "x").is_dir() and not list(folder.glob(".together*"))
