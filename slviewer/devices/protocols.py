@@ -27,7 +27,7 @@ class CameraSettings:
 
     def __post_init__(self) -> None:
         if self.exposure_ms is not None and not 0 < self.exposure_ms <= 600_000:
-            raise InputError(f"an exposure of {self.exposure_ms:g} ms is impossible: give a time above 0")
+            raise InputError(f"an exposure of {self.exposure_ms:g} ms is impossible: give one above 0, up to 600,000")
         if self.gain is not None and not 0 < self.gain <= 1e6:
             raise InputError(f"a gain of {self.gain:g} is impossible: give a factor above 0, 1 for none")
 

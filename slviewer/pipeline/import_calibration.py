@@ -17,6 +17,7 @@ from slviewer.pipeline.models import available_models, load_stereo, save_importe
 from slviewer.pipeline.open_session import opened_or_made
 from slviewer.reconstruction.axis_agreement import check_phases
 from slviewer.session.importers import opencv_calibration
+from slviewer.session.importers.filestorage import read_storage
 from slviewer.session.store import Session
 
 Size = str | tuple[int, int]
@@ -51,8 +52,9 @@ def import_opencv_calibration(
     the session contradict the calibration: R and T inverted, matrices exchanged or at another pixel scale, another rig.
     """
     path = Path(file)
-    matrices = opencv_calibration.read(path, keys)
-    stated = opencv_calibration.read_sizes(path)
+    storage = read_storage(path)
+    matrices = opencv_calibration.read_matrices(storage, keys)
+    stated = opencv_calibration.read_sizes(storage)
     with opened_or_made(session) as store:
         there = available_models(store)
         if there and not force:
@@ -79,7 +81,8 @@ def import_opencv_calibration(
 
 def identify_calibration_keys(file: Path | str) -> dict[str, str]:
     """{entry: the file's name for it}, as ``import_opencv_calibration`` takes them by default. Raises InputError."""
-    return dict(zip(opencv_calibration.ENTRIES, opencv_calibration.identify_keys(Path(file)), strict=True))
+    keys = opencv_calibration.identify_keys(read_storage(Path(file)))
+    return dict(zip(opencv_calibration.ENTRIES, keys, strict=True))
 
 
 def _resolve_size(

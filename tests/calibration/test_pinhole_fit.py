@@ -14,6 +14,7 @@ from slviewer.geometry.lens import Lens
 from slviewer.pipeline.export import export
 from slviewer.pipeline.models import frame_of, save_fitted, save_stereo, warn_if_frame_changed
 from slviewer.session.importers import opencv_calibration
+from slviewer.session.importers.filestorage import read_storage
 from slviewer.session.store import Session
 
 __all__ = ["coarse_knots"]  # a fixture for every test here
@@ -81,7 +82,7 @@ def test_the_exported_file_is_the_models_own_and_names_its_frame(models, true, t
     assert frame in found.words
     text = found.path.read_text()
     assert frame in text and "fit_rms_px_camera" in text and "model: splined" in text
-    read = opencv_calibration.read(found.path)
+    read = opencv_calibration.read_matrices(read_storage(found.path))
     lens = Lens(read["K_camera"], read["D_camera"], true.camera.size)
     off = cloud_offsets(splined, true, lens)
     assert np.sqrt(np.mean(off**2)) < 0.05

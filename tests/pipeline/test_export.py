@@ -23,6 +23,7 @@ from slviewer.pipeline.export import FORMATS, export
 from slviewer.pipeline.mesh import mesh
 from slviewer.pipeline.models import save_fitted, save_stereo
 from slviewer.session.importers import opencv_calibration
+from slviewer.session.importers.filestorage import read_storage
 from slviewer.session.ply import read_ply, write_ply
 from slviewer.session.store import Session
 
@@ -138,7 +139,7 @@ def test_a_merge_and_one_surface_through_it(kept: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize("suffix", FORMATS["calibration"])
 def test_a_calibration_comes_back(kept: Path, tmp_path: Path, suffix: str) -> None:
     path = export(kept, "calibration", out=tmp_path / f"c.{suffix}").path
-    read = opencv_calibration.read(path)
+    read = opencv_calibration.read_matrices(read_storage(path))
     np.testing.assert_allclose(read["R"], RIG.R, atol=1e-12)
     np.testing.assert_allclose(read["T"], RIG.t, atol=1e-12)
     np.testing.assert_allclose(read["D_camera"], RIG.camera.D, atol=1e-12)

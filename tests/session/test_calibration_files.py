@@ -7,6 +7,7 @@ import pytest
 from slviewer.errors import InputError
 from slviewer.session.exporters import write_calibration
 from slviewer.session.importers import opencv_calibration
+from slviewer.session.importers.filestorage import Storage, read_storage
 
 KEYS = ("M1", "D1", "M2", "D2", "rot", "trans")
 
@@ -32,7 +33,9 @@ def write(path, entries):
 
 @pytest.mark.parametrize("suffix", [".yml", ".xml", ".json"])
 def test_a_file_of_opencv_is_read(tmp_path, suffix):
-    read = opencv_calibration.read(write(tmp_path / f"a{suffix}", {"note": "made elsewhere", **rig()}), KEYS)
+    read = opencv_calibration.read_matrices(
+        read_storage(write(tmp_path / f"a{suffix}", {"note": "made elsewhere", **rig()})), KEYS
+    )
     assert list(read) == list(opencv_calibration.ENTRIES)
     for key, entry in zip(KEYS, opencv_calibration.ENTRIES, strict=True):
         expected = np.append(rig()[key], 0.0) if key == "D2" else rig()[key]
@@ -49,7 +52,7 @@ def test_what_is_written_is_read_back(tmp_path, suffix):
     path = tmp_path / f"calibration{suffix}"
     for _ in range(2):  # the second replaces the first
         write_calibration(path, {**entries, "rms_px": 0.25, "camera_size": (1600, 1200), "program": "slviewer"})
-    read = opencv_calibration.read(path)
+    read = opencv_calibration.read_matrices(read_storage(path))
     for key, value in entries.items():
         np.testing.assert_allclose(read[key], value.reshape(read[key].shape), rtol=1e-14, atol=1e-14)
     assert [entry.name for entry in tmp_path.iterdir()] == [path.name]
@@ -87,7 +90,7 @@ def test_what_cannot_be_written_leaves_the_old_file(tmp_path):
 def test_what_cannot_be_used_is_named(tmp_path, change, message):
     entries = {key: value for key, value in {**rig(), **change}.items() if value is not None}
     with pytest.raises(InputError, match=message):
-        opencv_calibration.read(write(tmp_path / "a.yml", entries), KEYS)
+        opencv_calibration.read_matrices(read_storage(write(tmp_path / "a.yml", entries)), KEYS)
 
 
 def test_other_shapes_that_mean_the_same(tmp_path):
@@ -96,7 +99,7 @@ def test_other_shapes_that_mean_the_same(tmp_path):
         "trans": rig()["trans"].T,
         "rot": rig()["rot"].round(6),
     }
-    read = opencv_calibration.read(write(tmp_path / "a.yml", {**rig(), **changed}), KEYS)
+    read = opencv_calibration.read_matrices(read_storage(write(tmp_path / "a.yml", {**rig(), **changed})), KEYS)
     np.testing.assert_array_equal(read["D_camera"], rig()["D1"].ravel())
     np.testing.assert_array_equal(read["T"], rig()["trans"].ravel())
     np.testing.assert_allclose(read["R"], rig()["rot"], atol=2e-6)
@@ -109,13 +112,41 @@ def test_files_that_are_no_storage(tmp_path, content):
         path = tmp_path / f"a{suffix}"
         path.write_text(content)
         with pytest.raises(InputError, match=f"a{suffix}"):
-            opencv_calibration.read(path, KEYS)
+            opencv_calibration.read_matrices(read_storage(path), KEYS)
     with pytest.raises(InputError):
-        opencv_calibration.read(tmp_path / "absent.yml", KEYS)
+        opencv_calibration.read_matrices(read_storage(tmp_path / "absent.yml"), KEYS)
     with pytest.raises(InputError, match=r"\b2\b"):
-        opencv_calibration.read(path, KEYS[:2])
+        opencv_calibration.read_matrices(Storage("a.yml", {}), KEYS[:2])
 
 
 def test_a_real_file_in_two_parts(real_data):
     with pytest.raises(InputError, match=r"intrinsic\.yml.*R, T.*M1, D1, M2, D2"):
-        opencv_calibration.read(real_data / "slmaster_david" / "intrinsic.yml", ("M1", "D1", "M2", "D2", "R", "T"))
+        opencv_calibration.read_matrices(
+            read_storage(real_data / "slmaster_david" / "intrinsic.yml"), ("M1", "D1", "M2", "D2", "R", "T")
+        )
+
+
+@pytest.mark.parametrize(
+    ("suffix", "content"),
+    [
+        (".json", '{"a": ' + "[" * 100_000),
+        (".yml", "%YAML:1.0\n---\na: " + "[" * 100_000),
+        (".xml", "<?xml version='1.0'?><opencv_storage>" + "<a>" * 100_000),
+        (
+            ".yml",
+            "%YAML:1.0\n---\nM1: !!opencv-matrix\n   rows: 2000000000\n   cols: 2000000000\n   dt: d\n   data: [1]\n",
+        ),
+    ],
+)
+def test_a_file_that_crashes_the_parser_is_refused(tmp_path, suffix, content):
+    path = tmp_path / f"a{suffix}"
+    path.write_text(content)
+    with pytest.raises(InputError, match=rf"a{suffix}"):
+        opencv_calibration.read_matrices(read_storage(path), KEYS)
+
+
+def test_other_entries_of_a_file_do_not_matter(tmp_path):
+    others = {"points": np.zeros((300, 200)), "M0": np.full((3, 3), np.nan), "note": "M1"}
+    storage = read_storage(write(tmp_path / "a.yml", {**others, **rig()}))
+    assert storage.entries["points"] is None and list(storage.entries) == [*others, *rig()]
+    np.testing.assert_array_equal(opencv_calibration.read_matrices(storage, KEYS)["K_camera"], rig()["M1"])

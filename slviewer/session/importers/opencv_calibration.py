@@ -1,20 +1,17 @@
 """A stereo calibration made elsewhere, in an OpenCV FileStorage file (YAML, XML or JSON)."""
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from pathlib import Path
-from typing import Any
+from collections.abc import Callable, Sequence
 
-import cv2
 import numpy as np
 
 from slviewer.errors import InputError
+from slviewer.session.importers.filestorage import Storage
 
 ENTRIES = ("K_camera", "D_camera", "K_projector", "D_projector", "R", "T")
 
 _ROTATION_TOLERANCE = 1e-4  # a matrix written with five digits still passes
 _SHORTEST_BASELINE_MM = 1.0
-
+_NAMED = 30
 
 _SPELLINGS: tuple[tuple[str, ...], ...] = (
     ENTRIES,
@@ -41,110 +38,58 @@ _SIZES = {
 """Where a file may state sizes, width before height."""
 
 
-def read(path: Path, keys: Sequence[str] | None = None) -> dict[str, np.ndarray]:
+def read_matrices(storage: Storage, keys: Sequence[str] | None = None) -> dict[str, np.ndarray]:
     """The matrices under the file's own `keys`, given in the order of `ENTRIES`, and named by these.
 
     K (3, 3) px; D (5,) = (k1, k2, p1, p2, k3); R (3, 3), the nearest rotation to what the file says; T (3,) mm; all
     float64. R and T map camera to projector. Without `keys`, those of `identify_keys`. Raises InputError where an entry
     is missing, has another shape, or says what pinhole and Brown distortion with square axes cannot.
     """
-    keys = identify_keys(path) if keys is None else keys
+    keys = identify_keys(storage) if keys is None else keys
     if len(keys) != len(ENTRIES):
         raise InputError(f"{len(keys)} keys were given: name those of {' '.join(ENTRIES)}, in this order")
-    with _open_storage(Path(path)) as storage:
-        there = list(storage.root().keys())
-        if missing := [key for key in keys if key not in there]:
-            raise InputError(
-                f"{Path(path).name} has no {', '.join(missing)}: its keys are {', '.join(there) or 'none'}"
-            )
-        matrices = [_read_matrix(storage.getNode(key), f"{Path(path).name}: {key}") for key in keys]
-    where = {entry: f"{Path(path).name}: {key}" for entry, key in zip(ENTRIES, keys, strict=True)}
-    values = dict(zip(ENTRIES, matrices, strict=True))
-    return {
-        "K_camera": _check_intrinsics(values["K_camera"], where["K_camera"]),
-        "D_camera": _check_distortion(values["D_camera"], where["D_camera"]),
-        "K_projector": _check_intrinsics(values["K_projector"], where["K_projector"]),
-        "D_projector": _check_distortion(values["D_projector"], where["D_projector"]),
-        "R": _check_rotation(values["R"], where["R"]),
-        "T": _check_translation(values["T"], where["T"]),
-    }
+    if missing := [key for key in keys if key not in storage.entries]:
+        raise InputError(f"{storage.name} has no {', '.join(missing)}: its keys are {_list_keys(storage)}")
+    matrices = {}
+    for entry, key in zip(ENTRIES, keys, strict=True):
+        matrices[entry] = _CHECKS[entry[0]](storage.matrix(key), f"{storage.name}: {key}")
+    return matrices
 
 
-def identify_keys(path: Path) -> tuple[str, ...]:
+def identify_keys(storage: Storage) -> tuple[str, ...]:
     """The file's names for the entries of `ENTRIES`, by the names that are common.
 
     Raises InputError where they are none of these, or where several would do.
     """
-    with _open_storage(Path(path)) as storage:
-        there = list(storage.root().keys())
     rows = [(*row[:4], *transform) for row in _SPELLINGS for transform in dict.fromkeys((row[4:], *_TRANSFORMS))]
-    matches = list(dict.fromkeys(row for row in rows if set(row) <= set(there)))
+    matches = list(dict.fromkeys(row for row in rows if set(row) <= set(storage.entries)))
     if len(matches) == 1:
         return matches[0]
-    remedy = f"name those of {' '.join(ENTRIES)} with --keys; its keys are {', '.join(there) or 'none'}"
+    remedy = f"name those of {' '.join(ENTRIES)} with --keys; its keys are {_list_keys(storage)}"
     if matches:
-        raise InputError(f"{Path(path).name} holds {' and '.join(', '.join(row) for row in matches)}: {remedy}")
-    raise InputError(f"the entries of {Path(path).name} have no names that are known here: {remedy}")
+        raise InputError(f"{storage.name} holds {' and '.join(', '.join(row) for row in matches)}: {remedy}")
+    raise InputError(f"the entries of {storage.name} have no names that are known here: {remedy}")
 
 
-def read_sizes(path: Path) -> dict[str, tuple[tuple[int, int], str]]:
+def read_sizes(storage: Storage) -> dict[str, tuple[tuple[int, int], str]]:
     """What a file states as sizes (width, height) px: {"camera" or "projector": (the size, the key that states it)}."""
     sizes = {}
-    with _open_storage(Path(path)) as storage:
-        there = list(storage.root().keys())
-        for device, spellings in _SIZES.items():
-            for spelling in spellings:
-                keys = (spelling,) if isinstance(spelling, str) else spelling
-                if not set(keys) <= set(there):
-                    continue
-                values = np.concatenate([_read_matrix(storage.getNode(key), key).ravel() for key in keys])
-                if values.shape == (2,) and (values >= 1).all() and (values == values.round()).all():
-                    sizes[device] = (int(values[0]), int(values[1])), " and ".join(keys)
-                    break
+    for device, spellings in _SIZES.items():
+        for spelling in spellings:
+            keys = (spelling,) if isinstance(spelling, str) else spelling
+            if not set(keys) <= set(storage.entries):
+                continue
+            values = np.concatenate([storage.matrix(key).ravel() for key in keys])
+            if values.shape == (2,) and (values >= 1).all() and (values == values.round()).all():
+                sizes[device] = (int(values[0]), int(values[1])), " and ".join(keys)
+                break
     return sizes
 
 
-@contextmanager
-def _open_storage(path: Path) -> Iterator[Any]:
-    """Context manager: the root of an OpenCV FileStorage file; InputError where it cannot be read."""
-    if not path.is_file():
-        raise InputError(f"{path} is no file: give an OpenCV FileStorage file (.yml, .xml or .json)")
-    unreadable = f"{path.name} is no OpenCV FileStorage file (.yml, .xml or .json): export the calibration again"
-    try:
-        storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
-    except (cv2.error, SystemError) as error:
-        raise InputError(unreadable) from error
-    try:
-        if not storage.isOpened():
-            raise InputError(unreadable)
-        yield storage
-    finally:
-        storage.release()
-
-
-def _read_matrix(node: Any, where: str) -> np.ndarray:
-    """A FileStorage matrix, or numbers in (nested) lists, as float64."""
-
-    def numbers(node: Any) -> Any:
-        """Return a node of numbers or nested sequences as a float or nested lists."""
-        if node.isSeq():
-            return [numbers(node.at(i)) for i in range(node.size())]
-        if node.isInt() or node.isReal():
-            return node.real()
-        raise ValueError
-
-    try:
-        if node.isInt() or node.isReal():
-            return np.array([node.real()])
-        matrix = node.mat() if node.isMap() else np.array(numbers(node), np.float64)
-        if matrix is None:
-            raise ValueError
-        matrix = np.asarray(matrix, np.float64)
-    except (ValueError, cv2.error) as error:
-        raise InputError(f"{where} is no matrix of numbers: name the key of one") from error
-    if not np.isfinite(matrix).all():
-        raise InputError(f"{where} holds numbers that are not finite: calibrate again")
-    return matrix
+def _list_keys(storage: Storage) -> str:
+    """Name the first keys of a file for a message."""
+    keys = list(storage.entries)
+    return ", ".join([*keys[:_NAMED], "..."] if len(keys) > _NAMED else keys) or "none"
 
 
 def _check_intrinsics(matrix: np.ndarray, where: str) -> np.ndarray:
@@ -194,3 +139,12 @@ def _check_translation(matrix: np.ndarray, where: str) -> np.ndarray:
     if np.linalg.norm(translation) < _SHORTEST_BASELINE_MM:
         raise InputError(f"{where} is {np.linalg.norm(translation):.3g} long: give the translation in mm")
     return translation
+
+
+_CHECKS: dict[str, Callable[[np.ndarray, str], np.ndarray]] = {
+    "K": _check_intrinsics,
+    "D": _check_distortion,
+    "R": _check_rotation,
+    "T": _check_translation,
+}
+"""The check of an entry, by its first letter."""

@@ -1,0 +1,119 @@
+"""OpenCV FileStorage files (YAML, XML, JSON), parsed in a process of its own.
+
+Some malformed ones crash OpenCV's parser, and others make it use all memory or never end.
+"""
+
+import json
+import os
+import subprocess
+import sys
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from slviewer.errors import InputError
+from slviewer.session.reading import read_file
+
+_MAX_BYTES = 1 << 24
+_MAX_NUMBERS = 10_000
+_MEMORY_BYTES = 2 << 30
+_SECONDS = 10  # of the processor
+_PATIENCE_S = 60
+
+
+@dataclass(frozen=True)
+class Storage:
+    """What a file holds at its top level: the ``name`` of the file, and for each key a float64 matrix, or None where
+    the entry is no matrix of numbers."""
+
+    name: str
+    entries: dict[str, np.ndarray | None]
+
+    def matrix(self, key: str) -> np.ndarray:
+        """The matrix under a key; InputError where it is none, or holds numbers that are not finite."""
+        matrix = self.entries[key]
+        if matrix is None:
+            raise InputError(f"{self.name}: {key} is no matrix of numbers: name the key of one")
+        if not np.isfinite(matrix).all():
+            raise InputError(f"{self.name}: {key} holds numbers that are not finite: calibrate again")
+        return matrix
+
+
+def read_storage(path: Path) -> Storage:
+    """The matrices of an OpenCV FileStorage file; InputError where it cannot be read."""
+    if not path.is_file():
+        raise InputError(f"{path} is no file: give an OpenCV FileStorage file (.yml, .xml or .json)")
+    try:
+        read_file(path, _MAX_BYTES)
+    except OSError as error:
+        raise InputError(f"{path} cannot be read ({error}): give an OpenCV FileStorage file") from error
+    environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    try:
+        ran = subprocess.run(
+            [sys.executable, "-m", __name__, str(path.absolute())],
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            timeout=_PATIENCE_S,
+            env=environment,
+        )
+        status = ran.returncode
+    except subprocess.TimeoutExpired:
+        status = -1
+    if status != 0:
+        reason = "is no" if status == 1 else "makes OpenCV's parser fail, as it is too large or no"
+        raise InputError(
+            f"{path.name} {reason} OpenCV FileStorage file (.yml, .xml or .json): export the calibration again"
+        )
+    entries = json.loads(ran.stdout)
+    return Storage(path.name, {key: None if v is None else np.array(v, np.float64) for key, v in entries.items()})
+
+
+def _limit_process() -> None:
+    """Limit memory and processor time of this process, where the system can."""
+    with suppress(ImportError, ValueError, OSError):
+        import resource
+
+        resource.setrlimit(resource.RLIMIT_AS, (_MEMORY_BYTES, _MEMORY_BYTES))
+        resource.setrlimit(resource.RLIMIT_CPU, (_SECONDS, _SECONDS))
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+
+
+def _parse(path: str) -> dict[str, Any]:
+    """Return {key: nested lists of numbers, or None} for the entries of a file. Raises what OpenCV raises."""
+    storage = cv2.FileStorage(path, cv2.FILE_STORAGE_READ)
+    if not storage.isOpened():
+        raise ValueError("no storage")
+    entries: dict[str, Any] = {}
+    for key in storage.root().keys():  # noqa: SIM118 (a FileNode is no dict)
+        try:
+            entries[key] = _numbers(storage.getNode(key))
+        except (ValueError, cv2.error):
+            entries[key] = None
+    return entries
+
+
+def _numbers(node: Any) -> list[Any]:
+    """A FileStorage matrix, or numbers in (nested) sequences, as nested lists; ValueError for anything else."""
+
+    def plain(node: Any, depth: int) -> Any:
+        """Return a node of numbers or nested sequences as a float or nested lists."""
+        if node.isInt() or node.isReal():
+            return node.real()
+        if not node.isSeq() or depth == 3 or node.size() > _MAX_NUMBERS:
+            raise ValueError("no numbers")
+        return [plain(node.at(i), depth + 1) for i in range(node.size())]
+
+    matrix = node.mat() if node.isMap() else np.atleast_1d(np.array(plain(node, 0), np.float64))
+    if matrix is None or matrix.size > _MAX_NUMBERS:
+        raise ValueError("no matrix")
+    numbers: list[Any] = np.asarray(matrix, np.float64).tolist()
+    return numbers
+
+
+if __name__ == "__main__":
+    _limit_process()
+    print(json.dumps(_parse(sys.argv[1])))
