@@ -251,11 +251,12 @@ class Session:
         changes.commit()
 
     def restore_last(self, name: str) -> None:
-        """Bring the last deleted capture or result of that name back. InputError where there is none, or the name is
-        in use."""
+        """Bring the last deleted capture or result of that name back. InputError without one, or where it is in use."""
         found = next((each for each in self.trashed() if each.name == name), None)
-        if found is None or (self._result_folder(name) if "/" in name else self._capture_folder(name)).exists():
-            raise InputError(f"no deleted {name!r} can be brought back: another may have its name now")
+        if found is None:
+            raise InputError(f"there is no deleted {'result' if '/' in name else 'capture'} {name!r}")
+        if (self._capture_folder if found.is_capture else self._result_folder)(name).exists():
+            raise InputError(f"there is a {name!r} again: delete that one first")
         self.restore([found])
 
     # results

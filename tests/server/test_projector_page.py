@@ -312,6 +312,7 @@ def test_a_window_that_changes_and_changes_back_still_ends_the_capture(opens, ch
     for width in (380, 360):
         page.set_viewport_size({"width": width, "height": 270})
         assert until(lambda width=width: channel.page_state().size == (width, 270))
+    assert channel.wait_ready(10.0).state == "ready"
     fails("window changed while patterns were shown", projector.show, 1)
     projector.load(SEQUENCE)
     projector.show(1)
