@@ -1,5 +1,7 @@
 """Measurement of the camera's noise from the frames of one capture."""
 
+from functools import cache
+
 import numpy as np
 from scipy.optimize import nnls
 
@@ -54,12 +56,11 @@ def sample(stack: np.ndarray, indices: tuple[int, ...]) -> np.ndarray:
     rows = np.unique(np.linspace(0, height - 1, min(ROWS, height)).round().astype(int))
     block = BLOCK if width >= BLOCK else 1
     step = max(1, width // (block * 64))
-    columns = (np.arange(0, width // block, step)[:, None] * block + np.arange(block)).ravel()
-    return (
-        np.stack([stack[i][rows[:, None], columns] for i in indices])
-        .astype(np.float32)
-        .reshape(len(indices), len(rows), -1, block)
-    )
+    blocks = len(rows), width // block, block
+    out = np.empty((len(indices), len(rows), -(-blocks[1] // step), block), np.float32)
+    for sampled, i in zip(out, indices, strict=True):
+        sampled[:] = stack[i][rows][:, : blocks[1] * block].reshape(blocks)[:, ::step]
+    return out
 
 
 def _measure_phase_step_noise(samples: np.ndarray, white: float) -> tuple[np.ndarray, np.ndarray, float]:
@@ -73,11 +74,17 @@ def _measure_phase_step_noise(samples: np.ndarray, white: float) -> tuple[np.nda
     if own < OWN_HARMONICS:
         residue -= fit_common_harmonics(frames, phasor, own)
     freedom = n - 1 - 2 * own
-    for vector in np.linalg.qr(cosine_columns(np.arange(n), n, own))[0].T.astype(np.float32):
-        # Not a matrix product: BLAS would start its threads for this little, and they get in the way of numba's.
-        residue -= vector[:, None] * np.einsum("k,kp->p", vector, residue)
-    variance = (residue**2).sum(axis=0).reshape(samples.shape[1:]).mean(axis=-1) / freedom
+    # Not a matrix product: BLAS would start its threads for this little, and they get in the way of numba's.
+    residue = np.einsum("wk,kp->wp", _list_residual_directions(n, own), residue)
+    variance = np.einsum("wp,wp->p", residue, residue).reshape(samples.shape[1:]).mean(axis=-1) / freedom
     return samples.mean(axis=(0, 2)), variance, freedom * samples.shape[-1]
+
+
+@cache
+def _list_residual_directions(n: int, own: int) -> np.ndarray:
+    """Return orthonormal rows (n - 1 - 2 own, n) float32: what cosines up to harmonic ``own`` of n steps do not fit."""
+    basis, _ = np.linalg.qr(cosine_columns(np.arange(n), n, own), mode="complete")
+    return np.ascontiguousarray(basis[:, 1 + 2 * own :].T.astype(np.float32))
 
 
 def _measure_inverse_noise(gray: np.ndarray, inverse: np.ndarray, white: float) -> tuple[np.ndarray, np.ndarray, float]:
@@ -106,7 +113,7 @@ def _measure_difference_noise(samples: np.ndarray, white: float) -> tuple[np.nda
 
 def _select_unclipped_blocks(samples: np.ndarray, white: float) -> np.ndarray:
     """Return a mask (rows, blocks) of the blocks clipped neither at white nor at black, which would hide noise."""
-    return (samples.max(axis=(0, -1)) < white) & (samples.min(axis=(0, -1)) > 0)
+    return (samples.max(axis=0).max(axis=-1) < white) & (samples.min(axis=0).min(axis=-1) > 0)
 
 
 def _bin_variances(
