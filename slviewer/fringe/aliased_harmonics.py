@@ -37,6 +37,9 @@ BANDS = 6
 FEWEST_BLOCKS = 6
 ROUNDS = 6
 """The phase itself is the argument of the ripple: fit and correct in turns, until both settle."""
+SETTLED = 0.01
+"""Change of both amplitudes, in their standard errors, below which they have settled; each round changes them by some
+percent of what the last one did."""
 OUTLIER = 4.0
 """Times the usual deviation beyond which a piece (an edge, a step) does not count."""
 
@@ -222,14 +225,15 @@ def _fit_ripple(pieces: _Pieces) -> tuple[_Amplitude, _Amplitude, float, float] 
     for _ in range(ROUNDS):
         added = _compute_correction(pieces.theta, n, M, d)
         theta = pieces.theta + added
-        ripples = [f(m * n * theta) for m in (1, 2) for f in (np.cos, np.sin)]
-        design = np.stack([np.ones_like(x), x, x**2, *ripples], axis=2)
+        cosine, sine = np.cos(n * theta), np.sin(n * theta)
+        columns = (np.ones_like(x), x, x**2, cosine, sine, 2 * cosine**2 - 1, 2 * sine * cosine)
+        design = np.stack(columns, axis=1)  # (k, 7, s)
         centred = theta - theta.mean(axis=1, keepdims=True)
-        target = np.stack([centred, pieces.modulation * np.cos(added)], axis=2)
-        transposed = design.transpose(0, 2, 1)
-        inverse = np.linalg.inv(transposed @ design + 1e-6 * size * np.eye(design.shape[2]))
-        weights = inverse @ (transposed @ target)
-        residual_rms = np.sqrt(np.mean((target - design @ weights) ** 2, axis=1))
+        target = np.stack([centred, pieces.modulation * np.cos(added)], axis=1)
+        inverse = np.linalg.inv(design @ design.transpose(0, 2, 1) + 1e-6 * size * np.eye(len(columns)))
+        weights = inverse @ (design @ target.transpose(0, 2, 1))
+        residual = target - weights.transpose(0, 2, 1) @ design
+        residual_rms = np.sqrt(np.einsum("kts,kts->kt", residual, residual) / size)
         good = (residual_rms < OUTLIER * np.median(residual_rms, axis=0)).all(axis=1)
         information = 1 / np.diagonal(inverse, axis1=1, axis2=2)
         # rows: constant, x, x^2, cos, sin, cos 2, sin 2; columns: phase, modulation
@@ -239,8 +243,10 @@ def _fit_ripple(pieces: _Pieces) -> tuple[_Amplitude, _Amplitude, float, float] 
         )
         if not np.isfinite([phase_sine[0], modulation_cosine[0]]).all():
             return None
-        limit = 0.9 / n
+        limit, before = 0.9 / n, (M, d)
         M, d = float(np.clip(modulation_cosine[0], -0.9, 0.9)), float(np.clip(d - phase_sine[0], -limit, limit))
+        if abs(M - before[0]) <= SETTLED * modulation_cosine[1] and abs(d - before[1]) <= SETTLED * phase_sine[1]:
+            break
     return (
         _Amplitude(M, modulation_cosine[1], modulation_sine[0]),
         _Amplitude(d, phase_sine[1], phase_cosine[0]),
@@ -273,6 +279,8 @@ def _compute_correction(theta: np.ndarray, n: int, M: float, d: float) -> np.nda
 
     It is the inverse of the ripple, from a table over one wave.
     """
+    if M == d == 0:
+        return np.zeros_like(theta)
     wave = np.linspace(-np.pi, np.pi, 1025)
     error = np.arctan2(-d * np.sin(wave), 1 + M * np.cos(wave))
     place = n * theta
