@@ -24,8 +24,8 @@ HALF, ONE, INVALID = np.float32(0.5), np.float32(1), np.float32(math.nan)
 EDGE, FAR_EDGE, WHOLE = np.float32(limits.EDGE), np.float32(1 - limits.EDGE), np.float32(limits.WHOLE_PERIOD)
 WINDOW, MAJORITY, NEIGHBOURS = limits.WINDOW, limits.SPIKE_MAJORITY, limits.SPIKE_NEIGHBOURS
 LONELY, LONELY_NEIGHBOURS = limits.LONELY, limits.LONELY_NEIGHBOURS
-RUN = 32
-"""Pixels that are passed over together where none is suspect."""
+RUN = 8
+"""Pixels that are passed over together where none is examined: their marks are one word."""
 
 
 class SpikeRules(NamedTuple):
@@ -139,38 +139,31 @@ def list_changes(
 @kernel()
 def _list_rows(start, stop, phase, rules, masking, columns, words, counts):
     """List the changes of a range of rows, see `list_changes`."""
-    width = phase.shape[1]
-    suspect, examined = np.empty(width, np.bool_), np.empty(width, np.bool_)
+    runs = np.zeros(-(-phase.shape[1] // RUN), np.uint64)
     for row in range(start, stop):
-        counts[row] = _list_row(phase, row, rules, masking, columns[row], words[row], suspect, examined)
+        counts[row] = _list_row(phase, row, rules, masking, columns[row], words[row], runs)
 
 
 @numba.njit
-def _list_row(phase, row, rules, masking, columns, words, suspect, examined):
+def _list_row(phase, row, rules, masking, columns, words, runs):
     """List the changes of one row and return their number.
 
-    Fills ``columns`` and ``words``; ``suspect`` and ``examined`` (w,) are buffers.
+    Fills ``columns`` and ``words``; ``runs`` is a buffer of a byte for each pixel, zero beyond the last.
     """
-    width = phase.shape[1]
-    low, high = np.float32(rules.low_rad), np.float32(rules.high_rad)
-    _mark_suspects(phase, row, np.float32(1 / rules.cell_rad), suspect)
-    own = phase[row]
-    for x in range(width):
-        suspect[x] &= own[x] == own[x]  # not NaN
-        examined[x] = suspect[x] | (masking & ((own[x] < low) | (own[x] > high)))
+    width, per_cell, examined = phase.shape[1], np.float32(1 / rules.cell_rad), runs.view(np.uint8)
+    low = np.float32(rules.low_rad if masking else -math.inf)
+    high = np.float32(rules.high_rad if masking else math.inf)
+    _mark_examined(phase, row, per_cell, low, high, examined)
     count = 0
-    for first in range(0, width, RUN):
-        last = min(first + RUN, width)
-        some = False
-        for x in range(first, last):
-            some |= examined[x]
-        if not some:
+    for run in range(len(runs)):
+        if runs[run] == 0:
             continue
-        for x in range(first, last):
+        for x in range(RUN * run, min(RUN * run + RUN, width)):
             if examined[x]:
-                word = (
-                    masking_reason(phase, row, x, suspect[x], rules) if masking else period_change(phase, row, x, rules)
-                )
+                if masking:
+                    word = masking_reason(phase, row, x, is_suspect(phase, row, x, per_cell), rules)
+                else:
+                    word = period_change(phase, row, x, rules)
                 if word != UNCHANGED:
                     columns[count], words[count] = x, word
                     count += 1
@@ -178,19 +171,24 @@ def _list_row(phase, row, rules, masking, columns, words, suspect, examined):
 
 
 @numba.njit(inline="always")
-def _mark_suspects(phase, row, per_cell, suspect):
-    """Mark the suspect pixels of a row, see `is_suspect`, without branches, for vector instructions."""
+def _mark_examined(phase, row, per_cell, low, high, examined):
+    """Mark the valid pixels of a row that are suspect, see `is_suspect`, or not in ``low`` to ``high``.
+
+    Without branches, for vector instructions.
+    """
     height, width = phase.shape
+    own = phase[row]
     if row == 0 or row == height - 1:
         for x in range(width):
-            suspect[x] = True
+            examined[x] = own[x] == own[x]  # not NaN
         return
-    over, own, under = phase[row - 1], phase[row], phase[row + 1]
-    for x in range(width):
-        suspect[x] = not (do_agree(own[x], over[x], per_cell) & do_agree(own[x], under[x], per_cell))
+    over, under = phase[row - 1], phase[row + 1]
     for x in range(1, width - 1):
-        suspect[x] |= not (do_agree(own[x], own[x - 1], per_cell) & do_agree(own[x], own[x + 1], per_cell))
-    suspect[0] = suspect[width - 1] = True
+        vertical = do_agree(own[x], over[x], per_cell) & do_agree(own[x], under[x], per_cell)
+        horizontal = do_agree(own[x], own[x - 1], per_cell) & do_agree(own[x], own[x + 1], per_cell)
+        usual = vertical & horizontal & (own[x] >= low) & (own[x] <= high)
+        examined[x] = (own[x] == own[x]) & (not usual)
+    examined[0], examined[width - 1] = own[0] == own[0], own[width - 1] == own[width - 1]
 
 
 @kernel()
