@@ -17,12 +17,12 @@ from slviewer.fringe.light_fit import (
     SHARE_PRIOR,
     Fit,
     Light,
+    LightModel,
     Remainder,
     Term,
     equalize_sample,
     fit_light,
     light_model,
-    locate_room_change,
 )
 from slviewer.fringe.light_sample import MIN_PIXELS, LightSample, estimate_albedo, sample_light
 from slviewer.fringe.sequence import Axis, PatternSequence
@@ -57,6 +57,8 @@ LEFT_OF_FRAME = 0.3
 CLEARLY_BETTER = 1.5
 """Both factors for Gray code alone whose residual exceeds noise: some percent of it are blur and scattered light
 that a wave along the rows, or room light, happens to fit."""
+MIN_FRAMES = 3
+"""Frames that must be known on either side of a change of the room's light: one or two may just be of other gain."""
 CYCLES = np.arange(0.5, 8.25, 0.25)
 """Waves along the image's height that are tried."""
 FINE = 0.05
@@ -288,14 +290,70 @@ def _list_candidate_models(sample: LightSample, gains: Fit) -> Iterator[tuple[tu
     """Yield the models besides gains alone, each with the light to start from."""
     constant = Light.constant(len(sample.frames))
     remainder = light_model(sample).eliminate(gains.light, gains.share, gains.weight)
+    changes_alone, changes_with_gain = _locate_room_changes(sample, constant, gains.weight)
     for terms in MODELS[1:]:
         start = replace(constant, gain=gains.light.gain) if "gain" in terms else constant
         if "wave" in terms:
             yield terms, replace(start, cycles=_estimate_strongest_wave(remainder))
-        else:
-            changes = locate_room_change(sample, constant, "gain" in terms, gains.weight)
-            if changes:
-                yield terms, replace(start, gain=constant.gain, changes=changes)
+        elif changes := changes_with_gain if "gain" in terms else changes_alone:
+            yield terms, replace(start, gain=constant.gain, changes=changes)
+
+
+def _locate_room_changes(
+    sample: LightSample, light: Light, weight: np.ndarray
+) -> tuple[tuple[int, ...], tuple[int, ...]]:  # fmt: skip
+    """Return the frame before which a change of the room light explains most of the residual; empty if there is none.
+
+    First of a change of room light alone, then together with gains. ``weight`` (p,) of the pixels.
+    """
+    model = light_model(sample)
+    if model.phased and not model.phase_freedom:  # three steps: nothing but the Gray code contradicts a change
+        return (), ()
+    remainder = model.eliminate(light, SHARE_PRIOR[0], weight)
+    normal, moment = remainder.normal_equations(
+        light, ("gain", "uniform", "albedo"), max(remainder.variance, 1e-3), SHARE_PRIOR[0]
+    )
+    u = len(model.used)
+    beside = range(5 * u, len(normal))
+    return (
+        _select_room_change(model, normal, moment, [*beside]),
+        _select_room_change(model, normal, moment, [*range(u), *beside]),
+    )
+
+
+def _select_room_change(
+    model: LightModel, normal: np.ndarray, moment: np.ndarray, free_columns: list[int]
+) -> tuple[int, ...]:  # fmt: skip
+    """Return the frame before which a change of the room light explains most of the residual; empty if there is none.
+
+    ``normal`` and ``moment`` of gains, uniform light and albedo. The unknowns ``free_columns``, which every change has
+    beside it, are eliminated first.
+    """
+    used, u = np.array(model.used), len(model.used)
+    inverse = np.linalg.inv(normal[np.ix_(free_columns, free_columns)])
+    cross = normal[u : 3 * u, free_columns] @ inverse
+    own = normal[u : 3 * u, u : 3 * u] - cross @ normal[free_columns, u : 3 * u]
+    target = moment[u : 3 * u] - cross @ moment[free_columns]
+    phased, coded = set(model.phased), set(model.sample.coded)
+    informed = np.array(model.informed)
+    before = np.searchsorted(np.sort(informed), used)
+    usable = [
+        int(k)
+        for k, count in sorted(zip(used, before, strict=True))[1:]
+        if min(count, len(informed) - count) >= MIN_FRAMES
+        # indistinguishable from where the fringes' mean lies
+        and {i for i in used if i >= k} not in (phased, coded)
+    ]
+    if not usable:
+        return ()
+    step = (used >= np.array(usable)[:, None]).astype(float)
+    part = step @ target.reshape(2, u).T
+    precision = np.stack(
+        [((step @ block) * step).sum(axis=1) for block in own.reshape(2, u, 2, u).swapaxes(1, 2).reshape(4, u, u)]
+    )
+    gain = np.einsum("ki,ki->k", part, np.linalg.solve(precision.T.reshape(-1, 2, 2), part[:, :, None])[:, :, 0])
+    best = int(np.argmax(gain))
+    return (usable[best],) if gain[best] > 0 else ()
 
 
 def _has_large_gains(sample: LightSample, fit: Fit) -> bool:
@@ -363,7 +421,7 @@ def _estimate_strongest_wave(remainder: Remainder) -> float:
     """Return the cycles per image height of the strongest wave that the residual light has along the rows."""
     excess, rows = remainder.row_excess()
     excess = excess - excess.mean(axis=1, keepdims=True)
-    power = [float(np.sum(np.abs(excess @ np.exp(-2j * np.pi * f * rows)) ** 2)) for f in CYCLES]
+    power = (np.abs(excess @ np.exp(-2j * np.pi * rows[:, None] * CYCLES)) ** 2).sum(axis=0)
     return float(CYCLES[int(np.argmax(power))])
 
 

@@ -38,14 +38,16 @@ HARMONIC_STEPS = 4
 """Largest number n of steps for which the fringe's harmonic n is significant in the background."""
 ONE_SIDED = 0.5
 """Length of the mean unit phasor above which a shift's pixels do not cover all phases."""
-MIN_FRAMES = 3
-"""Frames that must be known on either side of a change of the room's light: one or two may just be of other gain."""
 MIN_ENTRIES = 0.03
 """Share of the sampled pixels that must be inside a coded frame's bright stripes."""
 MAX_STEPS = 6
 CONVERGED = 5e-4
 OUTLIER = 4.0
 """A pixel whose residual is larger than the median pixel's by this factor in square loses weight."""
+CACHED_LIGHTS = 4
+"""Lights of a sample whose residuals are cached."""
+
+_Projected = tuple[np.ndarray, np.ndarray, np.ndarray, list[np.ndarray], list[tuple[slice, np.ndarray]]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,6 +71,17 @@ class Light:
     def constant(cls, count: int, cycles: float = 0.0) -> "Light":
         """Return equal light for ``count`` frames."""
         return cls(np.ones(count), np.zeros((count, 2)), cycles, np.zeros(count), np.zeros((count, 3)))
+
+    @property
+    def key(self) -> tuple[bytes | float | tuple[int, ...], ...]:
+        """Key of the values that equalized frames depend on, the same for equal lights."""
+        varies = bool(self.uniform.any() or self.albedo.any())
+        values = (self.gain, self.wave, self.uniform, self.albedo)
+        return (
+            *(part.tobytes() for part in values),
+            self.cycles if self.wave.any() else 0.0,
+            self.changes if varies else (),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,41 +128,6 @@ def fit_light(
             break
     remainder = model.eliminate(light, share, weight)
     return Fit(light, tuple(terms), remainder.variance, share, weight, model.informed)
-
-
-def locate_room_change(sample: LightSample, light: Light, with_gain: bool, weight: np.ndarray) -> tuple[int, ...]:
-    """Return the frame before which a change of the room light explains most of the residual; empty if there is none.
-
-    ``with_gain``: together with gains, else alone; ``weight`` (p,) of the pixels.
-    """
-    model = light_model(sample)
-    remainder = model.eliminate(light, SHARE_PRIOR[0], weight)
-    normal, moment = remainder.normal_equations(
-        light, ("gain", "uniform", "albedo"), max(remainder.variance, 1e-3), SHARE_PRIOR[0]
-    )
-    used, u = np.array(model.used), len(model.used)
-    free_columns = [*(range(u) if with_gain else ()), *range(5 * u, len(normal))]
-    # Unknowns that every change has beside it are eliminated first.
-    inverse = np.linalg.inv(normal[np.ix_(free_columns, free_columns)])
-    cross = normal[u : 3 * u, free_columns] @ inverse
-    own = normal[u : 3 * u, u : 3 * u] - cross @ normal[free_columns, u : 3 * u]
-    target = moment[u : 3 * u] - cross @ moment[free_columns]
-    best, at = 0.0, tuple[int, ...]()
-    if model.phased and not model.phase_freedom:  # three steps: nothing but the Gray code contradicts a change
-        return at
-    phased, coded = set(model.phased), set(sample.coded)
-    informed = np.array(model.informed)
-    for k in sorted(used)[1:]:
-        if min(np.count_nonzero(informed < k), np.count_nonzero(informed >= k)) < MIN_FRAMES:
-            continue
-        if {i for i in used if i >= k} in (phased, coded):  # indistinguishable from where the fringes' mean lies
-            continue
-        step = np.kron(np.eye(2), (used >= k).astype(float)[:, None])
-        part = step.T @ target
-        gain = float(part @ np.linalg.solve(step.T @ own @ step, part))
-        if gain > best:
-            best, at = gain, (int(k),)
-    return at
 
 
 def equalize_sample(sample: LightSample, light: Light, used: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
@@ -210,6 +188,7 @@ class LightModel:
     def __init__(self, sample: LightSample) -> None:
         """Build the model of a sample."""
         self.sample = sample
+        self._projected: dict[object, _Projected] = {}
         self.phased = [i for shift in sample.shifts for i in shift]
         self.used = [*self.phased, *sample.coded]
         n = len(self.phased)
@@ -249,8 +228,18 @@ class LightModel:
     def eliminate(self, light: Light, share: float, weight: np.ndarray) -> "Remainder":
         """Eliminate pattern and surface from the frames under a light; the residual contains only light and noise.
 
-        ``share``: see `Fit`; ``weight`` (p,) of the pixels.
+        ``share``: see `Fit`; ``weight`` (p,) of the pixels. Several models start from the same light, or one from
+        another's result: the last lights' residuals are cached.
         """
+        key = light.key
+        projected = self._projected.pop(key, None) or self._project(light)
+        self._projected[key] = projected  # the latest is last
+        if len(self._projected) > CACHED_LIGHTS:
+            del self._projected[next(iter(self._projected))]
+        return Remainder(self, *projected, self.counts, share, weight)
+
+    def _project(self, light: Light) -> _Projected:
+        """Return gain, shown, left, levels and harmonics of a `Remainder`, all that depends on the light alone."""
         sample, n = self.sample, len(self.phased)
         frames, gain = equalize_sample(sample, light, self.used)
         shown, left = np.zeros_like(frames), np.zeros_like(frames)
@@ -275,7 +264,7 @@ class LightModel:
             shown[n:] += level * members
             levels.append(level)
         left[n:] = (frames[n:] - shown[n:]) * sample.interior
-        return Remainder(self, gain, shown, left, levels, self.counts, harmonics, share, weight)
+        return gain, shown, left, levels, harmonics
 
 
 @dataclass(eq=False)
@@ -292,8 +281,8 @@ class Remainder:
     shown: np.ndarray
     left: np.ndarray
     levels: list[np.ndarray]
-    counts: list[np.ndarray]
     harmonics: list[tuple[slice, np.ndarray]]
+    counts: list[np.ndarray]
     share: float
     weight: np.ndarray
 
@@ -467,12 +456,12 @@ class Remainder:
             "albedo": light.albedo[model.used],
         }
         known = np.isin(model.used, model.informed)
+        relative = np.eye(u) + COMMON * np.outer(known, known)  # the frames' mean is the scene's own
         columns = [(term, column) for term in terms for column in now[term].T]
         for a, (term, column) in enumerate(columns):
             here = slice(a * u, (a + 1) * u)
             precision = (PRIOR[term] * self.scale(term)) ** -2
-            common = COMMON if term in ("gain", "wave") else 0.0  # the frames' mean is the scene's own
-            normal[here, here] += precision * (np.eye(u) + common * np.outer(known, known))
+            normal[here, here] += precision * (relative if term in ("gain", "wave") else np.eye(u))
             moment[here] -= precision * column
         phased, coded = known & (np.arange(u) < n), known & (np.arange(u) >= n)
         if terms[0] == "gain" and self.linked.any() and coded.any():

@@ -1,6 +1,7 @@
 """Sample of the pixels with fringes, and the cosine fitted to each of them."""
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
@@ -141,29 +142,44 @@ def fit_common_harmonics(frames: np.ndarray, phasor: np.ndarray, own: int) -> np
     Harmonic m of the fringe appears among n steps as the m-th, or as its alias.
     """
     n = len(frames)
+    waves, aliases = _list_common_harmonics(n, own)
+    if not aliases:
+        return np.zeros_like(frames)
     strength = np.abs(phasor)
     unit = phasor / np.maximum(strength, np.float32(1e-6))
     powers = {1: unit}
     for m in range(2, HIGHEST + 1):
         powers[m] = powers[m - 1] * unit
-    waves, parts = [], []
-    for q in range(own + 1, n // 2 + 1):
-        regressors = [strength * powers[m] for m in range(2, HIGHEST + 1) if (m - q) % n == 0]
-        regressors += [strength * np.conj(powers[m]) for m in range(2, HIGHEST + 1) if (m + q) % n == 0]
-        if not regressors:
-            continue
-        angle = 2 * np.pi * q * np.arange(n) / n
-        wave = np.stack([np.cos(angle), -np.sin(angle)]).astype(np.float32)
-        scale = np.float32((1 if 2 * q == n else 2) / n)
+    measured = np.einsum("wk,kp->wp", waves, frames)
+    parts = np.empty_like(measured)
+    for place, (scale, direct, mirrored) in enumerate(aliases):
         residual = np.empty_like(phasor)
-        residual.real, residual.imag = scale * np.einsum("wk,kp->wp", wave, frames)
-        design = np.stack(regressors)
+        residual.real, residual.imag = scale * measured[2 * place : 2 * place + 2]
+        design = np.stack([strength * powers[m] for m in direct] + [strength * np.conj(powers[m]) for m in mirrored])
         normal, moment = design.conj() @ design.T, design.conj() @ residual
-        weights = np.linalg.pinv(normal, rcond=1e-4) @ moment
+        if len(design) == 1:  # the pseudo-inverse of one number, in a tenth of the time
+            weights = moment * (1 / normal.real[0]) if normal[0, 0] else np.zeros_like(moment)
+        else:
+            weights = np.linalg.pinv(normal, rcond=1e-4) @ moment
         common = np.einsum("r,rp->p", weights, design)
-        waves.append(wave)
-        parts += [common.real, common.imag]
-    return np.concatenate(waves).T @ np.stack(parts) if parts else np.zeros_like(frames)
+        parts[2 * place], parts[2 * place + 1] = common.real, common.imag
+    return waves.T @ parts
+
+
+@cache
+def _list_common_harmonics(n: int, own: int) -> tuple[np.ndarray, list[tuple[np.float32, list[int], list[int]]]]:
+    """Return the waves beyond harmonic ``own`` of n steps, (2 q, n) float32, in which harmonics of a fringe appear.
+
+    Also, for each of the q: the scale of its amplitude, and the harmonics that appear in it directly and mirrored.
+    """
+    waves, aliases = [np.zeros((0, n))], []
+    for q in range(own + 1, n // 2 + 1):
+        direct, mirrored = ([m for m in range(2, HIGHEST + 1) if (m + s * q) % n == 0] for s in (-1, 1))
+        if direct or mirrored:
+            angle = 2 * np.pi * q * np.arange(n) / n
+            waves.append(np.stack([np.cos(angle), -np.sin(angle)]))
+            aliases.append((np.float32((1 if 2 * q == n else 2) / n), direct, mirrored))
+    return np.concatenate(waves).astype(np.float32), aliases
 
 
 def _list_adjacent_frames(indices: tuple[int, ...], count: int) -> list[int]:
