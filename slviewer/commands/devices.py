@@ -37,7 +37,7 @@ def run_capture(capture: Callable[..., Any], arguments: dict[str, Any]) -> None:
     from slviewer.pipeline.inspect import summarise_capture
 
     with _serve_projector_page(arguments.pop("port")) as set_up:
-        saved = call(capture, set_up=set_up, **arguments)
+        saved = call(capture, set_up=set_up, say=terminal.print_result, **arguments)
     terminal.print_result(summarise_capture(saved))
 
 

@@ -40,10 +40,13 @@ class Tool:
     def pick(self, place: Place) -> tuple[Place, ...] | None:
         """Add a click on the surface; returns all points once the tool has enough, and starts again.
 
-        A tool that fits replaces its point instead, until the operator accepts the region.
+        A tool that fits replaces its point instead, until the operator accepts the region. The same point again, as by
+        a double click, is no second point.
         """
         if self.fits:
             self.picked = [place]
+            return None
+        if place in self.picked:
             return None
         self.picked.append(place)
         if len(self.picked) < len(_CLICKS.get(self.name, ())):

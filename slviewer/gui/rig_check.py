@@ -10,26 +10,15 @@ from slviewer.wizard.snapshot import Snapshot
 
 _TONES: dict[CheckVerdict, Tone] = {"good": "good", "warning": "warning", "bad": "error", "unknown": "dim"}
 _MARKS: dict[CheckVerdict, str] = {"good": "✓", "warning": "!", "bad": "✕", "unknown": "?"}
-_EXPOSURES: dict[str, tuple[float, ...]] = {
-    "1": (),
-    "2: 1×, 4×": (1.0, 4.0),
-    "3: ¼×, 1×, 4×": (0.25, 1.0, 4.0),
-}
 
 
 class RigCheck:
-    """Inputs of the step Rig for its check and the exposures of captures."""
+    """Inputs of the step Rig for its check."""
 
     def __init__(self, context: PanelContext) -> None:
         self._context = context
         self._drawn: Preflight | None = None
         gui, operator = context.gui, context.operator
-        self._exposures = gui.add_dropdown(
-            "Exposures", tuple(_EXPOSURES), hint="Several for shiny and dark parts: each pixel uses the best"
-        )
-        self._exposures.on_update(context.callback(self._set_exposures, by_user=True))
-        self._exposures_value = SessionValue(self._exposures)
-        self._exposures_note = Text(gui)
         self._check = context.button(
             "Check rig", operator.check_rig, viser.Icon.STETHOSCOPE, None, hint="Takes about 10 s"
         )
@@ -42,17 +31,10 @@ class RigCheck:
         self._linear.on_update(context.callback(lambda: operator.set_linear_light(self._linear.value), by_user=True))
 
     def draw(self, snapshot: Snapshot) -> None:
-        """Show the result of the last check, and the session's exposures."""
+        """Show the result of the last check."""
         session, result, rig = snapshot.session, snapshot.preflight, snapshot.rig
         recorded = rig.choice is not None and rig.choice.get("driver") == "replay"  # a recording cannot be checked
         change(self._check, disabled=rig.state != "open" or rig.capture is not None or recorded)
-        exposures = session.exposures_ms if session else ()
-        label = next((label for label, times in _EXPOSURES.items() if len(times) == len(exposures)), None)
-        if label is not None:
-            self._exposures_value.update(label)
-        each = ", ".join(f"{exposure:g}" for exposure in exposures)
-        self._exposures_note.write(f"Exposures of each capture: {each} ms." if exposures else "", "dim")
-        change(self._exposures, visible=rig.exposure_ms is not None, disabled=rig.state != "open")
         change(self._linear, visible=bool((result and result.levels) or (session and session.is_linear)))
         self._linear_value.update(bool(session and session.is_linear))
         better = result.exposure_ms if result else None
@@ -63,12 +45,6 @@ class RigCheck:
         if result is not self._drawn:
             self._drawn = result
             self._results.set(checks_table(result) if result else "")
-
-    def _set_exposures(self) -> None:
-        """Request the chosen multiples of the current exposure."""
-        now = self._context.operator.snapshot().rig.exposure_ms
-        if now is not None:
-            self._context.operator.set_exposures([now * times for times in _EXPOSURES[self._exposures.value]])
 
     def _set_exposure(self) -> None:
         """Request the exposure that the check recommends."""

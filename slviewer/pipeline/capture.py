@@ -1,7 +1,7 @@
 """Captures without a browser: show the patterns, capture the frames, save them, as the wizard does."""
 
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,11 +10,12 @@ from slviewer.devices.protocols import CameraSettings, Rig
 from slviewer.errors import InputError, SessionError, SlviewerError
 from slviewer.fringe.presets import PRESETS
 from slviewer.fringe.sequence import PatternSequence
-from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
+from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings, part
 from slviewer.pipeline.frame_check import save_check
 from slviewer.pipeline.open_session import opened_or_made
 from slviewer.pipeline.rig_choice import RigSetup, SetUp, set_up
 from slviewer.pipeline.rig_presets import RigLike, load_rig
+from slviewer.pipeline.suggest_exposure import BUDGET_S, MAX_SUGGESTED, apply_suggestion, suggest_exposure
 from slviewer.session.atomic import format_bytes
 from slviewer.session.capture import Capture, Role
 from slviewer.session.names import safe_name
@@ -36,9 +37,13 @@ def capture(
     exposure_ms: float | None = None,
     exposures_ms: Sequence[float] = (),
     gain: float | None = None,
+    auto_exposure: bool = False,
+    region: tuple[int, int, int, int] | None = None,
+    budget_s: float = BUDGET_S,
     force: bool = False,
     set_up: SetUp = set_up,
     progress: Progress = ignore_progress,
+    say: Callable[[str], None] = ignore_warnings,
     warn: Warn = ignore_warnings,
 ) -> Capture:
     """Capture with a rig, without the wizard.
@@ -54,14 +59,17 @@ def capture(
         exposures_ms: Two or more exposures for shiny and dark parts; each pixel is used from the longest that does not
             clip it.
         gain: Gain of the camera, as a factor; by default the rig's, else what the camera is set to.
+        auto_exposure: Choose one to four exposures, and the gain, that measure as much of the scene as possible.
+        region: With --auto-exposure: x, y, width and height, px, of the part of the image that matters; by default all.
+        budget_s: With --auto-exposure: what the capture may last, s.
         force: Replace a capture of that name (the old one goes to the session's trash).
 
-    ``warn`` is called with what the camera could not be set to, and with frames that contradict the others. Raises
-    InputError, DeviceError, SessionError, and whatever `progress` raises before the capture is saved; nothing is saved
-    then.
+    ``warn`` is called with what the camera could not be set to, and with frames that contradict the others; `say` with
+    the exposures that were chosen. Raises InputError, DeviceError, SessionError, and whatever `progress` raises before
+    the capture is saved; nothing is saved then.
     """
-    if exposure_ms is not None and exposures_ms:
-        raise InputError("both one exposure and several were given: give either")
+    if (exposure_ms is not None) + bool(exposures_ms) + auto_exposure > 1:
+        raise InputError("the exposure was given in several ways: give one, several, or let it be chosen")
     exposures = check_exposures(exposures_ms) if exposures_ms else []
     target = None if board is None else Board.parse(board)
     safe_name(name)
@@ -77,14 +85,22 @@ def capture(
         progress(0.0, "opening the devices")
         bench = set_up(choice, target)
         sequence = choose_sequence(bench, patterns)
-        _check_disk_space(store, bench, len(sequence.frames) * max(1, len(exposures)))
+        most = MAX_SUGGESTED if auto_exposure else max(1, len(exposures))
+        _check_disk_space(store, bench, len(sequence.frames) * most)
+        begin = 0.3 if auto_exposure else 0.0
         with bench.rig.opened() as devices:
             set_camera(devices, choice, exposure_ms, gain, warn)
+            if auto_exposure:
+                suggested = suggest_exposure(
+                    devices, sequence, budget_s=budget_s, region=region, progress=part(progress, 0.0, begin)
+                )
+                say(suggested.text())
+                exposures = apply_suggestion(devices, suggested)
             captured = capture_with_texture(
                 devices,
                 sequence,
                 exposures,
-                progress=lambda done, n: progress(0.95 * done / n, f"{name}: frame {done} of {n}"),
+                progress=lambda done, n: progress(begin + (0.95 - begin) * done / n, f"{name}: frame {done} of {n}"),
             )
         progress(0.95, "saving")
         purpose = "pose" if role == "calibration" else "scan"

@@ -86,12 +86,7 @@ class CaptureRequests(ResultRequests):
     def _capture_scan(self, purpose: Purpose, label: str, follow: Callable[[str], object]) -> None:
         """Queue the capture of a scan, plane or sphere; `follow(name)` is called once it is saved."""
         engine, store = self._engine, self._engine.store
-        calibration = engine.publisher.refresh().calibration
-        if calibration is None:
-            raise InputError("calibrate first: a capture cannot be measured without a calibration")
-        sequence = pose_sequence(engine)
-        if engine.bench is not None and engine.bench.reel is None:
-            sequence = one_axis(sequence, depth_axis(calibration.stereo.rig))  # half of the frames
+        sequence = scan_sequence(engine)
         name, source = self._next_name(purpose), engine.acquisition.view().name
 
         def save(captured: CapturedFrames) -> None:
@@ -155,6 +150,18 @@ def pose_sequence(engine: Engine) -> PatternSequence:
     sequence = choose_sequence(engine.bench, engine.reader.patterns())
     levels = engine.reader.levels()
     return sequence if levels is None else replace(sequence, levels=levels)
+
+
+def scan_sequence(engine: Engine) -> PatternSequence:
+    """Return the sequence for scans: that of poses along the one axis that measures depth. InputError before a
+    calibration."""
+    calibration = engine.publisher.refresh().calibration
+    if calibration is None:
+        raise InputError("calibrate first: a capture cannot be measured without a calibration")
+    sequence = pose_sequence(engine)
+    if engine.bench is None or engine.bench.reel is not None:
+        return sequence
+    return one_axis(sequence, depth_axis(calibration.stereo.rig))  # half of the frames
 
 
 def depth_axis(rig: StereoRig) -> Axis:

@@ -36,7 +36,16 @@ from slviewer.wizard.preview_watcher import HandsFree, Watch, Watcher
 from slviewer.wizard.publisher import Listeners, Publisher
 from slviewer.wizard.result_views import thumbnail
 from slviewer.wizard.session_reader import SessionReader
-from slviewer.wizard.snapshot import Brightness, PreviewView, RigView, SessionView, Snapshot, Space, WorldView
+from slviewer.wizard.snapshot import (
+    Brightness,
+    ExposureChange,
+    PreviewView,
+    RigView,
+    SessionView,
+    Snapshot,
+    Space,
+    WorldView,
+)
 from slviewer.wizard.steps import Facts, views
 
 READ_ATTEMPTS = 20
@@ -57,6 +66,7 @@ class Engine:
         self.hands_free = HandsFree()
         self.bench: RigSetup | None = None
         self.preflight: Preflight | None = None  # of the rig in use
+        self.exposure_change: ExposureChange | None = None  # of the rig in use
         self._autopilot = ""
         self._preparing: float | None = None
         self._merge_failure = ""
@@ -144,7 +154,7 @@ class Engine:
             except SlviewerError as error:
                 if rig:
                     raise
-                self._choice, self.bench, self.preview, self.preflight = dict(choice), None, None, None
+                self._forget_rig(choice, None)
                 self._rig_fault = str(error)
                 self.acquisition.use(None)
                 self.notices.add_failure("Choosing the rig", error)
@@ -173,9 +183,14 @@ class Engine:
                     store.decide(decision, None)
             exposure = store.decision("exposure") if store is not None else None
             exposure = exposure or {key: choice[key] for key in ("exposure_ms", "gain") if choice.get(key)}
-            self._choice, self.bench, self.preview, self.preflight = dict(choice), bench, None, None
+            self._forget_rig(choice, bench)
             self._rig_fault = ""
             self.acquisition.use(bench.rig, CameraSettings(**exposure) if exposure else None)
+
+    def _forget_rig(self, choice: Choice, bench: RigSetup | None) -> None:
+        """Forget what was measured with the rig before, and remember the new one."""
+        self._choice, self.bench, self.preview = dict(choice), bench, None
+        self.preflight = self.exposure_change = None
 
     def save_rig(self, name: str, what: str) -> None:
         """Save the rig in use, with its exposure, as a preset of the session."""
@@ -379,6 +394,7 @@ class Engine:
             hands_free=self.hands_free.is_on,
             autopilot=self._autopilot,
             preflight=self.preflight,
+            exposure_change=self.exposure_change,
             live=self.live.figures() if self.live is not None and self.live.is_running else None,
             merge_failure=self._merge_failure,
             read_failure=read_failure,

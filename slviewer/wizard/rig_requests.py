@@ -1,24 +1,26 @@
 """Requests that concern the session, the devices, the target, and the scene of the simulated rig."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from slviewer.devices.capture import check_exposures
-from slviewer.devices.protocols import CameraSettings
+from slviewer.devices.protocols import CameraSettings, Rig
 from slviewer.devices.world import Thing
 from slviewer.errors import InputError
 from slviewer.fringe.presets import PRESETS
 from slviewer.pipeline.check_results import CheckVerdict, Preflight
+from slviewer.pipeline.feedback import Progress
 from slviewer.pipeline.rig_choice import Choice
+from slviewer.pipeline.suggest_exposure import BUDGET_S, ExposureSuggestion, suggest_exposure
 from slviewer.preflight.check_rig import preflight
 from slviewer.simulation.boards import Pose
 from slviewer.target.board import Board
 from slviewer.wizard.acquisition import LIGHTS
-from slviewer.wizard.capture_requests import pose_sequence
+from slviewer.wizard.capture_requests import pose_sequence, scan_sequence
 from slviewer.wizard.requests import RequestHandler, request
-from slviewer.wizard.snapshot import Level
+from slviewer.wizard.snapshot import ExposureChange, Level
 
 _CHECKED: dict[CheckVerdict, tuple[Level, str]] = {
     "good": ("good", "the rig is ready to capture"),
@@ -64,6 +66,53 @@ class RigRequests(RequestHandler):
     def set_exposures(self, exposures_ms: Sequence[float]) -> None:
         """Set several exposures, ms, for every capture, for shiny and dark parts; empty: a single one."""
         self._engine.store.decide("exposures", check_exposures(exposures_ms) if exposures_ms else [])
+
+    @request("Suggesting the exposure")
+    def suggest_exposure(self, for_scan: bool = False, budget_s: float = BUDGET_S) -> None:
+        """Choose, with the patterns of a pose or of a scan, exposures that measure as much as possible, and set them.
+
+        The snapshot has what they measure; `undo_exposure` sets the ones before.
+        """
+        engine, bench = self._engine, self._engine.bench
+        sequence = scan_sequence(engine) if for_scan else pose_sequence(engine)
+        current_ms = engine.reader.exposures_ms()
+
+        def work(rig: Rig, progress: Progress) -> ExposureSuggestion:
+            """Take the bracket and choose."""
+            return suggest_exposure(rig, sequence, current_ms=current_ms, budget_s=budget_s, progress=progress)
+
+        def done(suggestion: ExposureSuggestion) -> None:
+            """Set what was chosen, if the rig is still in use."""
+            with engine.lock:
+                if engine.bench is not bench:
+                    return
+                store, now = engine.store, engine.acquisition.view()
+                before = store.decision("exposure") or {"exposure_ms": now.exposure_ms, "gain": now.gain}
+                engine.exposure_change = ExposureChange(suggestion, before, engine.reader.exposures_ms())
+                exposures = suggestion.exposures_ms
+                self._decide_exposure(
+                    {"exposure_ms": exposures[0], "gain": suggestion.gain}, exposures if len(exposures) > 1 else ()
+                )
+            engine.publisher.mark_changed(session=True)
+            engine.notices.add("good", suggestion.text())
+
+        engine.acquisition.run_task("Suggesting the exposure", work, done)
+
+    @request("Undoing the exposure")
+    def undo_exposure(self) -> None:
+        """Set the exposures from before the last suggestion."""
+        with self._engine.lock:
+            change = self._engine.exposure_change
+            if change is None:
+                raise InputError("no suggested exposure is set: nothing can be undone")
+            self._engine.exposure_change = None
+            self._decide_exposure(change.exposure_before or {}, change.exposures_before_ms)
+
+    def _decide_exposure(self, exposure: Mapping[str, float | None], exposures_ms: Sequence[float]) -> None:
+        """Set the camera's exposure and gain, and the exposures of each capture, none for a single one."""
+        self._engine.acquisition.set_camera(CameraSettings(**exposure))
+        self._engine.store.decide("exposure", dict(exposure))
+        self._engine.store.decide("exposures", list(exposures_ms))
 
     @request("Checking the rig")
     def check_rig(self) -> None:

@@ -13,6 +13,7 @@ from slviewer.calibration.next_pose import Coverage, Suggestion
 from slviewer.calibration.stereo import StereoModel
 from slviewer.evaluation.crossvalidation import CrossValidation
 from slviewer.pipeline.check_results import Preflight
+from slviewer.pipeline.suggest_exposure import ExposureSuggestion
 from slviewer.report.data import SpacingRow, VerificationView
 from slviewer.session.measurements import Measurement
 from slviewer.wizard.pose_plan import PlanInput, PosePlan
@@ -25,6 +26,16 @@ Brightness = Literal["", "saturated", "dim"]
 
 SATURATED, DIM = 0.005, 0.35
 """Share of saturated pixels above which, and brightness of the brightest ones below which, an image is reported."""
+
+
+@dataclass(frozen=True)
+class ExposureChange:
+    """Exposures that were suggested and set, and what they replaced: exposure and gain as the session remembers them,
+    None where it did not, and the exposures of each capture, none where it was a single one."""
+
+    suggestion: ExposureSuggestion
+    exposure_before: dict[str, float | None] | None
+    exposures_before_ms: tuple[float, ...]
 
 
 @dataclass(frozen=True)
@@ -335,6 +346,7 @@ class Snapshot:
     hands_free: bool
     autopilot: str  # what it does now; empty where it is off
     preflight: Preflight | None = None  # result of the last check of the rig in use
+    exposure_change: ExposureChange | None = None  # the last suggestion for the rig in use, unless it was undone
     live: LiveView | None = None  # None while no live scan runs
     merge_failure: str = ""  # why the last merge was refused, or failed
     read_failure: str = ""  # why this is not the current state: files that could not be read just now

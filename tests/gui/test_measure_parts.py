@@ -50,6 +50,7 @@ def test_every_tool_says_what_to_do_and_ends_with_what_it_needs() -> None:
         assert tool.clicks == (name not in COMPARE)
     tool.select("Distance")
     assert tool.pick((1, 2)) is None and "second" in tool.instruction
+    assert tool.pick((1, 2)) is None and "second" in tool.instruction  # a double click
     assert tool.pick((3, 4)) == ((1, 2), (3, 4)) and "first" in tool.instruction  # ready for the next distance
     tool.select("Point")
     assert tool.pick(7) == (7,)

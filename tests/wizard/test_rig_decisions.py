@@ -46,6 +46,27 @@ def test_poses_in_several_exposures_are_judged_as_others_are(operator: Operator)
     assert operator.session.load_capture("pose_02").exposures_ms == ()
 
 
+def test_a_suggested_exposure_is_set_and_can_be_undone(operator: Operator) -> None:
+    assert operator.set_exposure(20.0) and operator.set_exposures((20.0, 90.0))  # far too bright
+    assert operator.undo_exposure() is False and "nothing can be undone" in last(operator.wait_until_idle())
+    assert operator.suggest_exposure()
+    after = operator.wait_until_idle()
+    change, session = after.exposure_change, after.session
+    assert change is not None and session is not None and last(after) == change.suggestion.text()
+    exposures = change.suggestion.exposures_ms
+    assert 0.7 < exposures[0] < 1.5  # at 1 ms the brightest reach the sensor's peak level
+    assert change.suggestion.share > 0.95 and change.suggestion.share_before < 0.2
+    assert session.exposures_ms == (exposures if len(exposures) > 1 else ())
+    assert operator.wait_for(lambda s: s.rig.exposure_ms == pytest.approx(exposures[0]), 5.0)
+    assert operator.capture_pose() and states(operator.wait_until_idle()) == {"pose_01": "good"}
+    assert operator.suggest_exposure(for_scan=True) is False and "calibrate first" in last(operator.wait_until_idle())
+    assert operator.undo_exposure()
+    undone = operator.wait_until_idle()
+    assert undone.exposure_change is None and undone.session is not None
+    assert undone.session.exposures_ms == (20.0, 90.0)
+    assert operator.wait_for(lambda s: s.rig.exposure_ms == 20.0, 5.0)
+
+
 def test_a_rig_is_kept_under_a_name_with_its_exposure(operator: Operator) -> None:
     assert operator.set_exposure(2.5)
     assert operator.wait_for(lambda s: s.rig.exposure_ms == 2.5, 5.0)

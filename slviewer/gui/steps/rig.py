@@ -2,6 +2,7 @@
 
 import time
 
+from slviewer.gui.exposures import ExposureInputs
 from slviewer.gui.inputs import SessionValue, change
 from slviewer.gui.panel import StepPanel
 from slviewer.gui.preview import draw_preview, exposure_html, histogram_chart, legend
@@ -35,11 +36,13 @@ class Panel(StepPanel):
         self._light = gui.add_dropdown("Projector", tuple(LIGHTS), hint="Shown between captures")
         self._light_value = SessionValue(self._light)
         self._light.on_update(context.callback(self._set_light, by_user=True))
+        self._exposures = ExposureInputs(context)
         self._check = RigCheck(context)
 
     def draw(self, snapshot: Snapshot) -> None:
         """Show the rig of a snapshot."""
         self._rig.draw(snapshot)
+        self._exposures.draw(snapshot)
         self._check.draw(snapshot)
         rig = snapshot.rig
         self._draw_exposure(rig)

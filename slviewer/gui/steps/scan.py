@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import viser
 
+from slviewer.gui.exposures import ExposureInputs
 from slviewer.gui.import_inputs import ImportInputs
 from slviewer.gui.inputs import Choice, RestoreButton, change, display_name
 from slviewer.gui.live import LAYER as LIVE
@@ -64,6 +65,7 @@ class Panel(StepPanel):
             self._capture = context.button(
                 "Capture scan", lambda: operator.capture_scan(self._label.value), viser.Icon.CAMERA, None
             )
+            self._exposures = ExposureInputs(context, for_scan=True)
             self._label = gui.add_text("Name", "", hint="Optional; numbered by default")
             self._live = context.button("Live", self._toggle_live, viser.Icon.PLAYER_PLAY, "teal", hint=LIVE_HINT)
             self._save = context.button(
@@ -108,6 +110,7 @@ class Panel(StepPanel):
             change(self._capture_folder, visible=rig.state != "none")
             change(self._capture, disabled=not ready)
             self._draw_live(snapshot.live, ready)
+            self._exposures.draw(snapshot)
             self._simulated.draw(snapshot)
             self._import.draw(snapshot)
             self._restore.offer(session.deleted_scans if session else ())

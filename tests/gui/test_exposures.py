@@ -1,0 +1,31 @@
+"""What the panel shows of exposures, without a browser."""
+
+import numpy as np
+import pytest
+
+from slviewer.gui.exposures import draw_suggestion, name_exposures, suggestion_html
+from slviewer.pipeline.suggest_exposure import STATES, ExposureSuggestion
+
+
+def test_a_suggestion_is_drawn_before_and_now() -> None:
+    state = np.full((6, 8), STATES.index("measured"), np.uint8)
+    before = state.copy()
+    before[:, :2], before[:, 2:4], state[0] = STATES.index("saturated"), STATES.index("dark"), STATES.index("unlit")
+    image = np.full((6, 8), 200, np.uint8)
+    suggestion = ExposureSuggestion((1.0, 8.0), 1.0, 0.875, 0.5, 3.25, state, before, image, 1)
+    picture = draw_suggestion(suggestion)
+    assert picture.shape[0] == 6 and picture.dtype == np.uint8
+    left, right = picture[:, :8], picture[:, -8:]
+    red, blue, grey = left[3, 0], left[3, 3], left[3, 6]
+    assert red[0] > 2 * red[2] and blue[2] > 2 * blue[0] and (grey == 200).all()
+    assert (right[1:] == 200).all() and (right[0] < 100).all(), "what the projector does not light is dim"
+    text = suggestion_html(suggestion)
+    assert "50.0 % measured" in text and "87.5 % measured" in text and "a&#160;capture" in text.replace(" ", "&#160;")
+
+
+@pytest.mark.parametrize(
+    ("exposures", "label"),
+    [((), "1"), ((2.0, 8.0), "2: 1×, 4×"), ((0.5, 2.0, 8.0), "3: ¼×, 1×, 4×"), ((2.0, 9.3), "as suggested")],
+)
+def test_exposures_are_named_by_their_multiples(exposures: tuple[float, ...], label: str) -> None:
+    assert name_exposures(exposures, 2.0) == label
