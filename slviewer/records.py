@@ -40,7 +40,8 @@ def from_plain(data: Any, kind: type[T]) -> T:
     try:
         return msgspec.convert(data, kind, dec_hook=_array)
     except msgspec.ValidationError as error:
-        raise InputError(f"This is no valid {kind.__name__}: {error}.") from error
+        reason, _, place = str(error).replace("`", "").partition(" - at $")
+        raise InputError(f"{place.strip('.') or 'its content'}: {reason[:1].lower()}{reason[1:]}") from error
 
 
 def plain_leaf(value: Any) -> Any:

@@ -21,7 +21,7 @@ from typing import Annotated, Any, Literal, Union, get_args
 import tyro
 
 from slviewer import terminal
-from slviewer.errors import SlviewerError
+from slviewer.errors import SlviewerError, UsageError
 
 ModelName = Literal["stereo", "pixelwise", "splined"]
 Run = Callable[[Callable[..., Any], dict[str, Any]], None]
@@ -39,6 +39,8 @@ class Option:
     help: str
 
 
+LARGEST = 1e12
+"""The largest number, of any unit, that a command takes."""
 JSON = Option("json", Path | None, None, "Write the result to this file too.")
 
 
@@ -88,7 +90,13 @@ def read_command(
 
     def parse(**arguments: Any) -> Callable[[], None]:
         """Return the work to do: the function, imported only when it is called, with the parsed arguments."""
-        return lambda: (run or show_result)(getattr(import_module(module), name), arguments)
+
+        def work() -> None:
+            """Check the numbers among the arguments, and run the function."""
+            _check_numbers({names.get(option, option): value for option, value in arguments.items()})
+            (run or show_result)(getattr(import_module(module), name), arguments)
+
+        return work
 
     parse.__doc__ = description + doc[doc.index("\n\n") :] if description else doc
     parse.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
@@ -136,6 +144,14 @@ def union(commands: Mapping[str, Callable[..., Any]]) -> Any:
     """Return the type whose value is one of the commands, for tyro."""
     choices = [Annotated[Any, tyro.conf.subcommand(name=name, constructor=f)] for name, f in commands.items()]
     return Union[tuple(choices)]  # noqa: UP007 (built at run time)
+
+
+def _check_numbers(arguments: Mapping[str, Any]) -> None:
+    """Raise UsageError for numbers that no quantity has: infinite ones, none, and beyond `LARGEST`."""
+    for name, value in arguments.items():
+        for number in value if isinstance(value, tuple | list) else (value,):
+            if isinstance(number, float | int) and not abs(number) <= LARGEST:
+                raise UsageError(f"--{name.replace('_', '-')} is {number:g}: give a number up to {LARGEST:g}")
 
 
 def _make_parameter(name: str, kind: Any, default: Any) -> inspect.Parameter:

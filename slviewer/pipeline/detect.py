@@ -1,6 +1,5 @@
 """Detecting a board in photographs: where its features are, or why it cannot be measured."""
 
-import csv
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +10,7 @@ import numpy as np
 
 from slviewer.errors import DetectionError, InputError
 from slviewer.fringe.layout import to_eight_bits
+from slviewer.printable import format_csv
 from slviewer.session.importers.images import read_image
 from slviewer.target.board import Board
 from slviewer.target.detect import Detection, detect
@@ -220,7 +220,5 @@ def _write_picture(path: Path, picture: np.ndarray) -> None:
 def _write_csv(path: Path, detected: BoardsDetected) -> None:
     """Write the detected features of all photographs as CSV, one row each."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w", newline="") as file:
-        table = csv.writer(file)
-        table.writerow(COLUMNS)
-        table.writerows((name, index, x, y, f"{u:.4f}", f"{v:.4f}") for name, index, x, y, u, v in detected.rows())
+    rows = ((name, index, x, y, f"{u:.4f}", f"{v:.4f}") for name, index, x, y, u, v in detected.rows())
+    path.write_text(format_csv([COLUMNS, *rows]), encoding="utf-8", newline="")

@@ -1,7 +1,5 @@
 """Documents of a session for other programs: the calibration, its coefficients, poses, verifications."""
 
-import csv
-import io
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +15,7 @@ from slviewer.pipeline.export_shapes import is_up_to_date
 from slviewer.pipeline.models import available_models, frame_of, load_model, load_stereo
 from slviewer.pipeline.open_session import numbered_results
 from slviewer.pipeline.scale import scale_factor
+from slviewer.printable import format_csv
 from slviewer.session.atomic import arriving_file, replace_file
 from slviewer.session.exporters import write_calibration
 from slviewer.session.names import natural_key
@@ -258,22 +257,15 @@ def write_table(store: Session, path: Path) -> None:
         raise InputError("nothing is verified yet: capture a plane or a sphere, and measure it in the step Verify")
     figures = ["rms_mm", "noise_floor_mm", "radius_mm", "points", "set_aside", "coverage"]
     ranges = ["R1", "R2", "R3"]
-    text = io.StringIO(newline="")
-    writer = csv.writer(text)
-    writer.writerow(["capture", "name", "shape", "model", *figures, *(f"{r}_percent" for r in ranges), "up_to_date"])
+    rows = [["capture", "name", "shape", "model", *figures, *(f"{r}_percent" for r in ranges), "up_to_date"]]
     for result in results:
         meta, name = store.load_result(result, only=())[0], result.removeprefix("verify/")
         label, shares, fresh = (
-            _safe_text(str(labels.get(name, name))),
+            str(labels.get(name, name)),
             meta["incidence"] or {},
             is_up_to_date(store, result),
         )
         for model, measured_by_model in meta["models"].items():
             measured = [measured_by_model.get(each) for each in figures] + [shares.get(each) for each in ranges]
-            writer.writerow([name, label, meta["shape"], model, *measured, "yes" if fresh else "no"])
-    replace_file(path, text.getvalue().encode())
-
-
-def _safe_text(text: str) -> str:
-    """Return a name that a spreadsheet does not interpret as a formula."""
-    return f"'{text}" if text[:1] in ("=", "+", "-", "@", "\t") else text
+            rows.append([name, label, meta["shape"], model, *measured, "yes" if fresh else "no"])
+    replace_file(path, format_csv(rows).encode())

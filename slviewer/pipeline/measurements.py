@@ -3,8 +3,7 @@
 Every function takes a session's folder or one that is open, and saves what it makes; the browser calls the same.
 """
 
-import csv
-import io
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -22,6 +21,7 @@ from slviewer.inspection.uncertainty import Spread
 from slviewer.pipeline.measured_surface import MeasuredSurface, Place
 from slviewer.pipeline.open_session import SessionLike, opened
 from slviewer.pipeline.scale import scale_factor
+from slviewer.printable import format_csv
 from slviewer.reconstruction.mesh import triangulate_grid
 from slviewer.reconstruction.reconstruct import JUMP
 from slviewer.records import from_plain
@@ -179,20 +179,28 @@ def describe_measurement(measured: Measurement) -> str:
 
 def measurements_csv(session: SessionLike) -> str:
     """All measurements as comma-separated values, one row a quantity; U where it is known."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(COLUMNS)
+    rows: list[Iterable[object]] = [COLUMNS]
     for each in load_measurements(session):
         for q in quantities_of(each):
             U = "" if q.U is None else f"{q.U:.6g}"
             whole = "" if q.U is None else ("yes" if q.whole else "no")
             state = "stale" if each.stale else "fresh"
-            # a name is the operator's own: a spreadsheet must not take it for a formula
-            name = f"'{each.name}" if each.name[:1] in "=+-@\t\r" else each.name
-            writer.writerow(
-                [each.id, name, each.kind, each.source, q.name, f"{q.value:.6f}", q.unit, U, whole, state, each.time]
+            rows.append(
+                [
+                    each.id,
+                    each.name,
+                    each.kind,
+                    each.source,
+                    q.name,
+                    f"{q.value:.6f}",
+                    q.unit,
+                    U,
+                    whole,
+                    state,
+                    each.time,
+                ]
             )
-    return text.getvalue()
+    return format_csv(rows)
 
 
 def export_measurements(session: SessionLike, out: Path | str) -> int:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from slviewer import __version__
 from slviewer.errors import InputError
+from slviewer.printable import escape_controls
 
 Mark = Literal["", "better", "worse", "strong", "muted"]
 """How a value stands to its rivals; colour and weight follow it, and the text beside it says so in words."""
@@ -177,7 +178,13 @@ def _render(title: str, subtitle: str, headlines: Sequence[Headline], sections: 
     with ThreadPoolExecutor(os.cpu_count()) as pool:  # the encoder releases the GIL
         pictures = dict(zip(figures, pool.map(_encode_webp, figures), strict=True))
     here = Path(__file__).parent
-    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    environment = Environment(
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        finalize=lambda value: escape_controls(value) if type(value) is str else value,  # not of Markup
+    )
     environment.tests["figure"] = lambda item: isinstance(item, Figure)
     environment.tests["table"] = lambda item: isinstance(item, Table)
     environment.tests["cell"] = lambda item: isinstance(item, Cell)

@@ -87,17 +87,18 @@ def expand_user(path: Path | str) -> Path:
 
 
 @contextmanager
-def decoding(place: Path | str, error: Callable[[str], Exception] = DamagedError) -> Iterator[None]:
+def decoding(
+    place: Path | str,
+    error: Callable[[str], Exception] = DamagedError,
+    remedy: str = "restore it from a copy, or compute or import it again",
+) -> Iterator[None]:
     """Context manager for decoding values read from ``place``: raise what unexpected ones cause as ``error``."""
     try:
         yield
     except InputError as fault:
-        raise error(f"{place} is damaged ({fault}): restore it from a copy, or compute or import it again") from fault
+        raise error(f"{place} is damaged ({fault}): {remedy}") from fault
     except _INVALID as fault:
-        raise error(
-            f"{place} is damaged ({type(fault).__name__}: {_reason(fault)}): "
-            "restore it from a copy, or compute or import it again"
-        ) from fault
+        raise error(f"{place} is damaged ({type(fault).__name__}: {_reason(fault)}): {remedy}") from fault
 
 
 def _check_values(data: Any) -> Any:

@@ -313,6 +313,7 @@ def read_decisions(path: Path) -> dict[str, Any]:
     if not path.exists():
         return {}
     decisions = read_json(path)
-    with decoding(path):
+    remedy = "correct it, or restore it from a copy; without it target, rig, names and exclusions are forgotten"
+    with decoding(path, remedy=remedy):
         from_plain(decisions, _Decisions)
     return decisions

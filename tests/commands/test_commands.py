@@ -199,6 +199,8 @@ def test_target_draws_a_sheet(run: Run, tmp_path: Path) -> None:
         (["verify", "SESSION", "--shape", "plane"], 2, "capture"),
         (["calibrate", "ONE", "--target", "chessboard:9x7:30"], 3, "usable pose"),
         (["simulate", "SESSION"], 1, "session already"),
+        (["reconstruct", "SESSION", "pose_01", "--depth-range", "nan", "3"], 2, "--depth-range is nan"),
+        (["capture", "SESSION", "new", "--rig", "simulated", "--budget-s", "inf"], 2, "--budget-s is inf"),
         (["import", "p18", "SESSION", "SESSION"], 1, "captures"),
     ],
 )

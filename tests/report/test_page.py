@@ -35,7 +35,8 @@ def test_a_page_needs_nothing_but_itself(tmp_path: Path) -> None:
 
 
 def test_texts_are_shown_and_never_run(tmp_path: Path) -> None:
-    page = write(tmp_path / "report.html", EVIL)
+    page = write(tmp_path / "report.html", EVIL + "\u202e\x1b[2J")
+    assert page.count("\\u202e\\x1b[2J") >= 12 and not {"\u202e", "\x1b"} & set(page)
     assert "<script" not in page and "<img src=y" not in page
     assert page.count("&lt;script&gt;alert(&#39;x&#39;)&lt;/script&gt;") >= 12
     assert not re.search(r'="[^"]*"quoted"', page)  # no attribute is broken out of
