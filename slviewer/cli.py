@@ -84,6 +84,7 @@ COMMANDS = Commands(
             options=[JSON],
             names={"models": "model", "depth_range": "range"},
         ),
+        "align": partial(read_command, "pipeline.align:align", "session", "captures", options=[JSON]),
         "merge": partial(read_command, "pipeline.merge:merge", "session", "captures", options=[JSON]),
         "mesh": partial(
             read_command, "pipeline.mesh:mesh", "session", "names", options=[*MESHING, JSON], run=run_meshing

@@ -7,8 +7,9 @@ from typing import Any, Literal
 
 import numpy as np
 
-from slviewer.errors import UsageError
+from slviewer.errors import InputError, UsageError
 from slviewer.evaluation import letter
+from slviewer.pipeline.align import load_places
 from slviewer.pipeline.capture_clouds import capture_cloud, check_capture_sizes
 from slviewer.pipeline.capture_phases import capture_texture, decode_captures
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings, stage
@@ -27,7 +28,7 @@ from slviewer.surface.fuse import Fused, fuse
 
 MAX_CONTRADICTION_SHARE = 0.01
 """Share of contradicting points from which on a pair is warned about: noise alone has fewer than one in a million."""
-StartKind = Literal["features", "turntable", "identity"]
+StartKind = Literal["features", "turntable", "identity", "placed"]
 Picked = Mapping[Pair, tuple[np.ndarray, np.ndarray]]
 """Of a pair (scan, onto): three or more points (n, 3) mm on either, in their cameras' frames."""
 
@@ -168,7 +169,7 @@ def merge(
         out: PLY file. Without it the session stores the merge as merge/1 and so on, for mesh, compare, measure and
             export, and its file is in the session's exports.
         start: Initial alignment: features estimates it from the scans; turntable uses --angle; identity assumes that
-            the scans are nearly aligned already.
+            the scans are nearly aligned already; placed takes the places that `align` found.
         angle: Degrees that the turntable turns from each capture to the next, with --start turntable.
         model: Which calibration to use; by default the best one available.
         accept_rejected: Use the calibration although its verdict rejects it.
@@ -187,8 +188,11 @@ def merge(
         if out.suffix.lower() != ".ply":
             raise UsageError(f"merged points are written as .ply, not as {out.name}: a mesh goes into other files too")
         out.parent.mkdir(parents=True, exist_ok=True)
-    starts = _initial_alignments(names, start, angle, axis, poses, picked, warn)
+    if start != "placed":
+        starts = _initial_alignments(names, start, angle, axis, poses, picked, warn)
     with opened(session, write=out is None) as store:
+        if start == "placed":
+            starts = _initial_alignments(names, "identity", angle, axis, _load_places(store, names), picked, warn)
         check_accepted(store, accept_rejected)
         fitted = load_model(store, model or preferred_model(store))
         warn_if_stale(store, warn)
@@ -228,6 +232,14 @@ def merge(
             store.save_result(result.result_name, merge_record(store, result, fitted.name), {})
     progress(1.0, "merged")
     return result
+
+
+def _load_places(store: Session, names: Sequence[str]) -> dict[str, np.ndarray]:
+    """The poses (4, 4) of scans that are in place, all in one frame; InputError where some are not."""
+    places = load_places(store)
+    if missing := [name for name in names if name not in places]:
+        raise InputError(f"{' and '.join(missing)} were not aligned: align them first, or start from features")
+    return {name: places[name] for name in names}
 
 
 def _scene_warnings(clouds: Mapping[str, Cloud], registered: ObjectAlignment, keep_background: bool) -> list[str]:

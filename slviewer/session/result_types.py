@@ -209,6 +209,16 @@ class _Merge(ResultMeta, total=False):
     shared: float | None
 
 
+class _Placement(ResultMeta, total=False):
+    """`placement/*`."""
+
+    T_first_scan: _Matrix4 | None
+    onto: str
+    rms_mm: float | None
+    overlap: float | None
+    why: str
+
+
 class _MeasurementData(TypedDict, total=False):
     """The entries of a measurement's data that several readers use."""
 
@@ -278,6 +288,7 @@ _Decisions = TypedDict(
         "sigma_wanted_mm": Annotated[float, msgspec.Meta(ge=0, lt=1e6)] | None,
         "rig": dict[str, Any] | None,
         "use_anyway": str | None,
+        "align_scans": bool | None,
     },
     total=False,
 )
@@ -296,6 +307,7 @@ _TYPES: dict[str, Any] = {
     "clouds": _Cloud,
     "verify": _Verified,
     "merge": _Merge,
+    "placement": _Placement,
     "measurements": _Measurement,
     "drift": _Drift,
     "acceptance": _Acceptance,

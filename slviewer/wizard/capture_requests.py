@@ -41,7 +41,7 @@ class CaptureRequests(ResultRequests):
     @request("Capturing the scan")
     def capture_scan(self, label: str = "") -> None:
         """Capture an object and reconstruct it; `label` is the operator's name for it, any text."""
-        self._capture_scan("scan", label, self.reconstruct)
+        self._capture_scan("scan", label, self._finish_scan)
 
     @request("Capturing the plane")
     def capture_plane(self, label: str = "") -> None:

@@ -56,7 +56,7 @@ class LiveRequests(CaptureRequests):
         save_frames(store, name, "scan", live.stream.sequence, captured, source=source, purpose="scan")
         self._set_label(name, label)
         engine.queue_processing()
-        self.reconstruct(name)
+        self._finish_scan(name)
 
     def subscribe_live(self, listener: Callable[[LiveCloud], None]) -> Callable[[], None]:
         """Call back with every live cloud, on the live scan's thread; returns a function that unsubscribes.

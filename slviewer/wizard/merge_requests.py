@@ -13,6 +13,7 @@ from slviewer.wizard.requests import RequestHandler, request
 MERGING = "Merging"
 _ALTERNATIVES = {
     "features": "Or use the initial alignment by picked points.",
+    "placed": "Or use the initial alignment by features, or by picked points.",
     "turntable": "Or use the initial alignment by features, or by picked points.",
     "identity": "Or use the initial alignment by features, or by picked points.",
     "picked": "Or pick other points.",

@@ -4,6 +4,8 @@ from collections.abc import Sequence
 from functools import partial
 
 from slviewer.errors import InputError
+from slviewer.pipeline.align import FOLDER as PLACEMENTS
+from slviewer.pipeline.align import Placement, remove_placement
 from slviewer.pipeline.calibrate import CalibrationResult
 from slviewer.pipeline.export import FORMATS, What, check_export
 from slviewer.pipeline.models import accept_rejected_calibration, accepts_rejected, available_models, check_accepted
@@ -34,7 +36,7 @@ class ResultRequests(RequestHandler):
         store = self._engine.store
         store.trash_capture(name)
         store.include(name)
-        for kind in ("poses", "clouds", "verify", "trust"):
+        for kind in ("poses", "clouds", "verify", "trust", PLACEMENTS):
             if store.state_of(f"{kind}/{name}") != "absent":
                 store.trash_result(f"{kind}/{name}")
 
@@ -106,6 +108,38 @@ class ResultRequests(RequestHandler):
         store.load_capture(name)
         reconstruct = partial(tasks.reconstruct_capture, store, name, model, warn=self._warn)
         self._submit("Reconstructing", reconstruct, lambda points: f"{name}: {points:,} points")
+
+    @request("Aligning")
+    def align(self, *names: str) -> None:
+        """Align reconstructed scans to those in place; without names all that were not aligned yet."""
+        engine, store = self._engine, self._engine.store
+        chosen = [store.load_capture(name).name for name in names]
+
+        def done(placements: list[Placement]) -> None:
+            """Report where each scan is, or why it is kept apart, and mark the session as changed."""
+            for placement in placements:
+                engine.notices.add("warning" if placement.T_first_scan is None else "good", placement.text())
+            engine.publisher.mark_changed(session=True)
+
+        engine.jobs.submit("Aligning", partial(tasks.place_scans, store, chosen, warn=self._warn), done)
+
+    @request("Undoing the alignment")
+    def undo_alignment(self, name: str) -> None:
+        """Take a scan away from the aligned ones."""
+        remove_placement(self._engine.store, name)
+
+    @request("Switching the alignment of scans")
+    def set_align_scans(self, on: bool) -> None:
+        """Align each new scan to those before it as soon as it is reconstructed; those that are there at once."""
+        self._engine.store.decide("align_scans", on or None)
+        if on:
+            self.align()
+
+    def _finish_scan(self, name: str) -> None:
+        """Reconstruct a scan that was just captured, and align it where that is wanted."""
+        self.reconstruct(name)
+        if self._engine.store.decision("align_scans"):
+            self.align(name)
 
     @request("Exporting")
     def export(self, what: What, name: str = "", file_format: str = "", plan: MeshingPlan | None = None) -> None:

@@ -13,6 +13,7 @@ from slviewer.errors import InputError
 from slviewer.fringe.hdr import radiance, toned
 from slviewer.fringe.layout import to_eight_bits
 from slviewer.fringe.sequence import Axis
+from slviewer.pipeline.align import AlignedScans, view_aligned
 from slviewer.pipeline.models import load_model, load_stereo
 from slviewer.pipeline.poses import load_observations
 from slviewer.pipeline.report import curve_at
@@ -75,6 +76,11 @@ def error_maps(session: Session, name: str) -> dict[str, np.ndarray]:
     """Load {model: (h, w) float32 mm} signed distances from the fitted plane or sphere, NaN where not measured."""
     arrays = session.load_result(f"verify/{name}")[1]
     return {key.removeprefix("error_"): array for key, array in arrays.items()}
+
+
+def aligned_scans(session: Session) -> AlignedScans:
+    """Load the scans in place, thinned, with the number of scans that see each point."""
+    return view_aligned(session)
 
 
 def merged_cloud(session: Session, name: str) -> Ply:

@@ -17,6 +17,7 @@ from slviewer.calibration.splined.model import SplinedModel
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import DamagedError, InputError, SessionError
 from slviewer.fringe.presets import PRESETS
+from slviewer.pipeline import align
 from slviewer.pipeline.calibration_verdict import load_last_verdict
 from slviewer.pipeline.capture import DEFAULT_PATTERNS
 from slviewer.pipeline.models import (
@@ -104,9 +105,8 @@ class SessionReader:
         """Store the features of a pose whose frames are still being examined, for the plan of the next pose."""
         sigma = observation.samples.sigma if observation.samples else np.zeros(0)
         with self._lock:
-            self._features[capture.hash, target] = _make_features(
-                observation.points, observation.camera, observation.projector, sigma
-            )
+            seen = observation.points, observation.camera, observation.projector
+            self._features[capture.hash, target] = _make_features(*seen, sigma)
 
     def add_unreadable(self, capture: Capture, why: str) -> None:
         """Store why a pose cannot be evaluated, so that it is not tried again."""
@@ -200,6 +200,7 @@ class SessionReader:
             exports=list_exports(session),
             exposures_ms=self.exposures_ms(),
             is_linear=self.levels() is not None,
+            aligns_scans=bool(session.decision("align_scans")),
             deleted_poses=tuple(session.deleted_captures("calibration")),
             deleted_scans=tuple(session.deleted_captures("scan")),
             faults=tuple(dict.fromkeys(self._faults)),
@@ -217,13 +218,11 @@ class SessionReader:
 
     def _load_judgement(self, capture: Capture, target: str) -> dict[str, Any] | None:
         """Return the `meta` of a pose's result; None unless it was made from these frames and this board."""
-        if not self.session.has_result(f"poses/{capture.name}"):
-            return None
         try:
-            meta = self._load_meta(f"poses/{capture.name}")
+            meta = self._find_meta(f"poses/{capture.name}")
         except DamagedError:  # the pose is evaluated again
             return None
-        return meta if meta["inputs"].get(capture.name) == capture.hash and meta["target"] == target else None
+        return meta if meta and meta["inputs"].get(capture.name) == capture.hash and meta["target"] == target else None
 
     def _read_poses(
         self,
@@ -384,11 +383,9 @@ class SessionReader:
 
     def _read_scan(self, capture: Capture, inputs: _Inputs) -> ScanView:
         """Return the view of a scan capture: its label, and the figures and staleness of its cloud."""
-        result = f"clouds/{capture.name}"
-        meta: dict[str, Any] = {}
-        if self.session.has_result(result):
-            meta = self._attempt(result, lambda: self._load_meta(result), meta)
-        depths = meta.get("depth_mm")
+        find = partial(self._find_meta, f"clouds/{capture.name}")
+        meta: dict[str, Any] = self._attempt(f"the cloud of {capture.name}", find, {})
+        depths, read = meta.get("depth_mm"), partial(self._read_placement, capture.name, inputs)
         return ScanView(
             name=capture.name,
             label=str(inputs.labels.get(capture.name, capture.name)),
@@ -402,7 +399,13 @@ class SessionReader:
             masked=meta.get("masked"),
             scale=meta.get("scale", ""),
             thumbnail=self._thumbnails.get(capture.hash, b""),
+            placement=self._attempt(f"the place of {capture.name}", read, None),
         )
+
+    def _read_placement(self, name: str, inputs: _Inputs) -> align.Placement | None:
+        """Return where a scan is among the aligned ones; None where that is unknown or outdated."""
+        meta = self._find_meta(f"{align.FOLDER}/{name}")
+        return align.read_placement(name, meta) if meta and inputs.is_fresh(meta) else None
 
     def _read_merges(self, inputs: _Inputs) -> list[MergeView]:
         """Read the merges whose scans all exist, with whether they are stale, in the order they were made."""
@@ -441,6 +444,10 @@ class SessionReader:
     def _list_results(self, prefix: str) -> list[str]:
         """List the names of the results with a prefix, in natural order."""
         return sorted((n for n in self.session.result_names() if n.startswith(prefix)), key=natural_key)
+
+    def _find_meta(self, name: str) -> dict[str, Any]:
+        """Return the `meta` of a result, empty where there is none."""
+        return self._load_meta(name) if self.session.has_result(name) else {}
 
     def _load_meta(self, result: str) -> dict[str, Any]:
         """Load the `meta` of a result, without its arrays."""

@@ -12,6 +12,7 @@ from slviewer.calibration.diagnosis.verdict import Verdict
 from slviewer.calibration.next_pose import Coverage, Suggestion
 from slviewer.calibration.stereo import StereoModel
 from slviewer.evaluation.crossvalidation import CrossValidation
+from slviewer.pipeline.align import Placement
 from slviewer.pipeline.check_results import Preflight
 from slviewer.pipeline.suggest_exposure import ExposureSuggestion
 from slviewer.report.data import SpacingRow, VerificationView
@@ -172,6 +173,7 @@ class ScanView:
     thumbnail: bytes = field(repr=False)
     masked: float | None = None  # share of the pixels outside the calibrated region; None: nothing is masked
     scale: str = ""  # the correction of scale in the cloud, in words
+    placement: Placement | None = None  # among the scans that are aligned as they come; None: it was not tried
 
 
 @dataclass(frozen=True)
@@ -300,6 +302,7 @@ class SessionView:
     deleted_scans: tuple[str, ...] = ()
     is_linear: bool = False  # whether patterns are corrected by the measured table of grey levels
     exposures_ms: tuple[float, ...] = ()  # of every capture; empty: a single one, the camera's
+    aligns_scans: bool = False  # each new scan to those before it
     faults: tuple[str, ...] = ()  # what is damaged, or no capture, and missing here, with the remedy
 
     @property

@@ -4,6 +4,7 @@
 `poses/<capture>`      the features of a target pose (`pipeline.poses`)
 `clouds/<capture>`     the organised cloud, with phase and modulation at each pixel
 `verify/<capture>`     error maps and figures of a plane or a sphere, model by model
+`placement/<capture>`  where a scan is among those that are aligned as they come
 `merge/<number>`       the alignment of scans; the points are in `exports/merged_<number>.ply`
 =====================  ============================================================================================
 
@@ -16,6 +17,7 @@ import numpy as np
 from slviewer.evaluation.crossvalidation import CrossValidation
 from slviewer.evaluation.plane import PlaneResult
 from slviewer.evaluation.sphere import SphereResult
+from slviewer.pipeline.align import Placement, align_scan, list_scans, load_placement
 from slviewer.pipeline.calibrate import CalibrationResult, calibrate
 from slviewer.pipeline.feedback import Warn
 from slviewer.pipeline.merge import Merge, Picked, StartKind, merge, merge_record
@@ -25,6 +27,7 @@ from slviewer.pipeline.reconstruct import reconstruct
 from slviewer.pipeline.scale import scale_factor
 from slviewer.pipeline.validate import validate
 from slviewer.pipeline.verify import Shape, verify
+from slviewer.reconstruction.cloud import Cloud
 from slviewer.session.store import Session
 from slviewer.wizard.export_files import staged_export
 from slviewer.wizard.jobs import Reporter
@@ -163,6 +166,18 @@ def describe_verifications(rms: dict[str, dict[str, float]]) -> str:
     """Describe verifications in one sentence: the RMS mm of each model on each capture."""
     figures = {name: ", ".join(f"{m} {mm:.3f} mm" for m, mm in models.items()) for name, models in rms.items()}
     return "; ".join(f"{name}: RMS {text}" for name, text in figures.items())
+
+
+def place_scans(session: Session, names: list[str], report: Reporter, warn: Warn) -> list[Placement]:
+    """Align scans to those in place; by default all that are reconstructed and were not aligned yet."""
+    chosen = names or [name for name in list_scans(session) if load_placement(session, name) is None]
+    fresh = [name for name in chosen if session.state_of(f"clouds/{name}") == "fresh"]  # or reconstructing failed
+    placements, guarded, clouds = [], session.guarded(report.saving), dict[str, Cloud]()
+    for i, name in enumerate(fresh):
+        report(i / len(fresh), f"aligning {name}")
+        placements.append(align_scan(guarded, name, clouds=clouds, warn=warn))
+    report(1.0, "aligned")
+    return placements
 
 
 def merge_scans(

@@ -153,3 +153,41 @@ def test_a_merge_of_before_that_kept_less_is_shown(tmp_path: Path) -> None:
     (shown,) = view.registered
     assert (shown.scan, shown.onto, shown.sigma_mm, shown.moved_mm) == ("b", "a", None, None)
     assert shown.turned_deg == pytest.approx(5) and view.loops == () and view.shared is None and view.stale
+
+
+def test_scans_are_aligned_as_they_come_and_merged_from_there(operator: Operator) -> None:
+    store = operator.session
+    assert store is not None
+    chosen = ("first", "ball_0", "second", "third")  # the ball has no place on the object
+    for name in chosen:
+        assert operator.reconstruct(name)
+    assert operator.align(*chosen)
+    assert operator.set_align_scans(True)  # nothing that was tried is tried again
+    snapshot, _ = settled(operator)
+    assert snapshot.session is not None and snapshot.session.aligns_scans
+    placed = {scan.name: scan.placement for scan in snapshot.session.scans if scan.placement is not None}
+    assert set(placed) == set(chosen)
+    assert "others are aligned" in placed["first"].text()
+    assert placed["ball_0"].T_first_scan is None and "kept apart" in placed["ball_0"].text()
+    for name in ("second", "third"):
+        T = placed[name].T_first_scan
+        assert T is not None and 0.003 < (placed[name].rms_mm or 0) < 0.3
+        D = T @ np.linalg.inv(truth(name))
+        assert 1e-5 < np.linalg.norm(D[:3, :3] @ MIDDLE + D[:3, 3] - MIDDLE) < 0.3
+    together = result_views.aligned_scans(store)
+    assert together.names == ("first", "second", "third") and 0.6 < together.share_seen_again < 1
+    assert 1 == together.seen_by.min() < together.seen_by.max() == 3
+
+    assert operator.merge(NAMES, "first", start="placed")
+    _, merge = settled(operator)
+    assert merge is not None and max(off_mm(merge, name) for name in NAMES[1:]) < 0.1
+
+    assert operator.undo_alignment("third")
+    snapshot, _ = settled(operator)
+    assert snapshot.session is not None and snapshot.scan("third").placement is None  # type: ignore[union-attr]
+    assert operator.merge(NAMES, "first", start="placed")
+    assert "third were not aligned" in settled(operator)[0].merge_failure
+    assert operator.align("third") and settled(operator)[0].scan("third").placement.onto == "second"  # type: ignore[union-attr]
+    assert operator.delete("third") and operator.undelete("third")
+    assert store.result_names().count("placement/third") == 0
+    assert operator.set_align_scans(False)

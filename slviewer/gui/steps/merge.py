@@ -15,8 +15,9 @@ from slviewer.gui.widgets import Text
 from slviewer.wizard.snapshot import MergeView, ScanView, SessionView, Snapshot
 
 LAYER = "merge"
-FEATURES, TURNTABLE, CURRENT, PICKED = "features", "turntable", "current position", "picked points"
-STARTS = (FEATURES, TURNTABLE, CURRENT, PICKED)
+FEATURES, PLACED, TURNTABLE = "features", "places while scanning", "turntable"
+CURRENT, PICKED = "current position", "picked points"
+STARTS = (FEATURES, PLACED, TURNTABLE, CURRENT, PICKED)
 SIDE_BY_SIDE = "side by side, to pick"
 _CURRENT_NOTE = "For scans between which neither the object nor the camera moved, or hardly."
 
@@ -217,6 +218,8 @@ class Panel(StepPanel):
         )
         if start == TURNTABLE:
             merge(names, reference, start="turntable", angle=float(self._angle.value))
+        elif start == PLACED:
+            merge(names, reference, start="placed")
         elif start == CURRENT:
             merge(names, reference, start="identity")
         elif start == PICKED:

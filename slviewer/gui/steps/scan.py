@@ -8,7 +8,7 @@ import viser
 
 from slviewer.gui.exposures import ExposureInputs
 from slviewer.gui.import_inputs import ImportInputs
-from slviewer.gui.inputs import Choice, RestoreButton, change, display_name
+from slviewer.gui.inputs import Choice, RestoreButton, SessionValue, change, display_name
 from slviewer.gui.live import LAYER as LIVE
 from slviewer.gui.live import LiveScreen
 from slviewer.gui.panel import PanelContext, StepPanel
@@ -31,13 +31,15 @@ from slviewer.gui.widgets import (
     to_html,
 )
 from slviewer.report.maps import error_limit
-from slviewer.wizard.result_views import ScanCloud, scan_cloud
+from slviewer.wizard.result_views import AlignedScans, ScanCloud, aligned_scans, scan_cloud
 from slviewer.wizard.snapshot import LiveView, PreviewView, ScanView, Snapshot
 
 LAYER = "scan"
 SMALL_PX = 380
 """Width of the live image: the cloud matters more here."""
 COLOURS = ("texture", "depth", "modulation", "noise", "uncertainty", "error")
+SEEN_ONCE, SEEN_AGAIN = (232, 140, 30), (20, 150, 140)
+ONE, ALIGNED = "one", "aligned"
 LIVE_HINT = "Continuous clouds of 11 frames each: faster and noisier than a capture"
 _STATES = {"absent": "not reconstructed", "fresh": "", "stale": "older calibration"}
 
@@ -51,6 +53,7 @@ class Panel(StepPanel):
     def __init__(self, context: PanelContext) -> None:
         super().__init__(context)
         self._known: tuple[str, ...] = ()
+        self._placed: tuple[str, ...] | None = None
         self._cloud: ScanCloud | None = None
         self._loaded: tuple[Any, ScanCloud] | None = None
         self._is_live = False
@@ -66,6 +69,11 @@ class Panel(StepPanel):
                 "Capture scan", lambda: operator.capture_scan(self._label.value), viser.Icon.CAMERA, None
             )
             self._exposures = ExposureInputs(context, for_scan=True)
+            self._align = gui.add_checkbox(
+                "Align as you scan", False, hint="Shows each new scan in its place beside those before it"
+            )
+            self._align_value = SessionValue(self._align)
+            self._align.on_update(context.callback(lambda: operator.set_align_scans(self._align.value), by_user=True))
             self._label = gui.add_text("Name", "", hint="Optional; numbered by default")
             self._live = context.button("Live", self._toggle_live, viser.Icon.PLAYER_PLAY, "teal", hint=LIVE_HINT)
             self._save = context.button(
@@ -84,6 +92,12 @@ class Panel(StepPanel):
                 viser.Icon.CUBE,
                 None,
             )
+            self._placement = Text(gui)
+            self._place = context.button("Align scan", lambda: operator.align(self._scan.value), viser.Icon.PUZZLE)
+            self._take_out = context.button(
+                "Undo alignment", lambda: operator.undo_alignment(self._scan.value), viser.Icon.ARROW_BACK_UP
+            )
+            self._view = Choice(gui, "3D view")
             self._colour = gui.add_dropdown("Colour", COLOURS)
             self._legend = Text(gui)
             context.view_button(lambda: self._cloud.points if self._cloud else None)
@@ -99,6 +113,7 @@ class Panel(StepPanel):
         self._restore = RestoreButton(context)
         self._import = ImportInputs(context, "scan")
         self._scan.on_change(context.callback(self._refresh))
+        self._view.on_change(context.callback(self._refresh))
         self._colour.on_update(context.callback(self._refresh))
 
     def draw(self, snapshot: Snapshot) -> None:
@@ -114,7 +129,9 @@ class Panel(StepPanel):
             self._simulated.draw(snapshot)
             self._import.draw(snapshot)
             self._restore.offer(session.deleted_scans if session else ())
+            self._align_value.update(bool(session and session.aligns_scans))
             scans = sort_scans(session.scans) if session else []
+            self._offer_views(scans)
             change(self._cloud_folder, visible=bool(scans))
             self._gallery.set(gallery(scans, self._scan.value))
             if session is None or not scans:
@@ -186,8 +203,15 @@ class Panel(StepPanel):
             label = "Reconstruct" if scan.cloud == "absent" else "Reconstruct again"
             change(self._reconstruct, disabled=self._snapshot.is_busy, label=label)
             self._figures.set(scan_html(scan))
+            self._draw_placement(scan, self._snapshot.is_busy)
             self._gallery.set(gallery(sort_scans(session.scans) if session else (), scan.name))
             if self._is_live:
+                return
+            if session is not None and self._view.value == ALIGNED:
+                placed = tuple((each.name, each.model) for each in session.scans if is_placed(each))
+                self._painter.request(
+                    "cloud", (ALIGNED, placed), lambda: aligned_scans(self._context.session), self._draw_aligned
+                )
                 return
             if scan.cloud == "absent":
                 self._clear_cloud()
@@ -204,6 +228,37 @@ class Panel(StepPanel):
                 return self._loaded[1], colour
 
             self._painter.request("cloud", (key, colour), make, self._draw_cloud)
+
+    def _offer_views(self, scans: Sequence[ScanView]) -> None:
+        """Offer to view the aligned scans together, and do so when another one came to its place."""
+        placed = tuple(sorted(scan.name for scan in scans if is_placed(scan)))
+        together = [(ALIGNED, f"{len(placed)} scans in place")] if len(placed) > 1 else []
+        self._view.offer([(ONE, "this scan"), *together], ONE)
+        if together and self._placed is not None and set(placed) - set(self._placed):
+            self._view.choose(ALIGNED)
+        self._placed = placed
+
+    def _draw_placement(self, scan: ScanView, is_busy: bool) -> None:
+        """State where the chosen scan is among the others, or why it is kept apart."""
+        placement = scan.placement
+        change(self._place, visible=scan.cloud == "fresh" and not is_placed(scan), disabled=is_busy)
+        change(self._take_out, visible=is_placed(scan), disabled=is_busy)
+        tone: Tone = "good" if is_placed(scan) else "warning"
+        self._placement.set("" if placement is None else paragraph(coloured(placement.text(), tone)))
+
+    def _draw_aligned(self, aligned: AlignedScans) -> None:
+        """Draw the scans in place, in the colours of how many see each point."""
+        if self._is_live:
+            return
+        self._cloud = None
+        self._scene.remove(LAYER, "picked")
+        self._point.set("")
+        painted = np.where(aligned.seen_by[:, None] > 1, SEEN_AGAIN, SEEN_ONCE).astype(np.uint8)
+        self._scene.cloud(LAYER, "cloud", aligned.points, painted)
+        self._scene.show(LAYER, self._visible)
+        self._legend.set(aligned_html(aligned))
+        if self._visible:
+            self._context.viewpoints.show(f"{LAYER} {ALIGNED}", aligned.points)
 
     def _draw_cloud(self, made: tuple[ScanCloud, str]) -> None:
         """Draw a loaded cloud in the chosen colours, unless a live scan runs."""
@@ -236,6 +291,21 @@ class Panel(StepPanel):
         u, v = pixel
         self._point.set(point_html(cloud, u, v))
         self._scene.mark(LAYER, "picked", cloud.points[v, u], f"({u}, {v}): z {cloud.points[v, u, 2]:.3f} mm")
+
+
+def is_placed(scan: ScanView) -> bool:
+    """Whether the scan is in its place beside others."""
+    return scan.placement is not None and scan.placement.T_first_scan is not None
+
+
+def aligned_html(aligned: AlignedScans) -> Html:
+    """State what the colours of the aligned scans mean."""
+    marks = "&ensp;".join(
+        f"<span style='color:rgb{colour}'>■</span> {text}"
+        for colour, text in ((SEEN_ONCE, "seen by one scan"), (SEEN_AGAIN, "by more than one"))
+    )
+    share = f"{100 * aligned.share_seen_again:.0f} % is seen by more than one; gaps were not seen yet."
+    return paragraph(Html(f"<div>{marks}</div>{coloured(share, 'dim')}"))
 
 
 def live_html(live: LiveView, shown: int) -> Html:
