@@ -19,7 +19,8 @@ from slviewer.pipeline.capture_phases import decode_captures
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
 from slviewer.pipeline.models import check_accepted, load_model, preferred_model
 from slviewer.pipeline.open_session import SessionLike, opened
-from slviewer.reconstruction.cloud import Cloud
+from slviewer.reconstruction.cloud import Cloud, choose_pixels
+from slviewer.reconstruction.reconstruct import normals
 from slviewer.registration.refusal import Refused
 from slviewer.registration.static_scene import register_object
 from slviewer.session.store import Session
@@ -59,11 +60,13 @@ class Placement:
 @dataclass(frozen=True, eq=False)
 class AlignedScans:
     """What the aligned scans show together: points (n, 3) float32 mm in the frame of the first one, and how many of
-    the scans see each of them, (n,) uint8. ``names``: the scans, in the order in which they were captured."""
+    the scans see each of them, (n,) uint8. ``facing`` (n,) float32: cosine of the angle between the surface's normal
+    and the view of its scan. ``names``: the scans, in the order in which they were captured."""
 
     names: tuple[str, ...]
     points: NDArray[np.float32]
     seen_by: NDArray[np.uint8]
+    facing: NDArray[np.float32]
 
     @property
     def share_seen_again(self) -> float:
@@ -192,16 +195,21 @@ def load_places(store: Session) -> dict[str, Floats]:
 def view_aligned(store: Session, clouds: dict[str, Cloud] | None = None) -> AlignedScans:
     """The scans in place, thinned, with the number of scans that see each point. ``clouds`` as for `align_scan`."""
     clouds = {} if clouds is None else clouds
-    thinned = {}
+    thinned, facing = {}, [np.zeros(0)]
     for name, T in load_places(store).items():
-        points = _load_cloud(store, name, clouds, ignore_warnings).measured
-        thinned[name] = move_points(T, points[:: max(1, len(points) // _SHOWN_POINTS)])
-    return count_views(thinned)
+        cloud = _load_cloud(store, name, clouds, ignore_warnings)
+        points, directions = cloud.measured, choose_pixels(normals(cloud.points), cloud.mask)
+        step = max(1, len(points) // _SHOWN_POINTS)
+        points, directions = points[::step], directions[::step]
+        thinned[name] = move_points(T, points)
+        facing.append(-np.sum(points * directions, axis=1) / np.linalg.norm(points, axis=1))
+    together, seen_by = count_views(thinned)
+    return AlignedScans(tuple(thinned), together, seen_by, np.nan_to_num(np.concatenate(facing)).astype(np.float32))
 
 
-def count_views(scans: Mapping[str, Floats]) -> AlignedScans:
-    """Count for every point (n, 3) mm of the scans, all in one frame, how many of them have a point near it."""
-    trees = {name: cKDTree(points) for name, points in scans.items() if len(points) > 1}
+def count_views(scans: Mapping[str, Floats]) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+    """Return all points (n, 3) mm of scans in one frame, and for each how many of the scans have a point near it."""
+    trees = {name: cKDTree(points) for name, points in scans.items()}
     spacing = [np.median(tree.query(tree.data[::20], k=2)[0][:, 1]) for tree in trees.values()]
     reach = _REACH * max(spacing, default=0.0)
     counts = []
@@ -211,8 +219,7 @@ def count_views(scans: Mapping[str, Floats]) -> AlignedScans:
             seen += np.isfinite(trees[other].query(trees[name].data, distance_upper_bound=reach, workers=-1)[0])
         counts.append(seen)
     points = [tree.data for tree in trees.values()]
-    return AlignedScans(
-        tuple(trees),
+    return (
         np.concatenate([np.zeros((0, 3)), *points]).astype(np.float32),
         np.concatenate([np.zeros(0, np.uint8), *counts]),
     )
