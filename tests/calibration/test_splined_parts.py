@@ -14,7 +14,8 @@ from slviewer.calibration.splined.fields import (
     undistort_pixel,
 )
 from slviewer.calibration.splined.model import SplinedModel
-from slviewer.calibration.splined.normal import normal_equations, predict_observations
+from slviewer.calibration.splined.normal import BlockFactor, normal_equations, predict_observations
+from slviewer.calibration.splined.prior import Prior
 from slviewer.calibration.splined.unknowns import State, pinhole_lens
 from slviewer.calibration.stereo import calibrate_stereo
 from slviewer.errors import InputError
@@ -83,6 +84,27 @@ def test_every_derivative_agrees_with_differences(seen, stereo) -> None:
     scale = np.sqrt(np.sum(W * J**2, axis=1)) + 1e-3
     assert np.abs(J @ (W * r) - b[chosen]).max() < 1e-5 * scale.max()
     assert np.abs(((J * W) @ J.T - A[np.ix_(chosen, chosen)]) / (scale[:, None] * scale)).max() < 1e-5
+
+
+@pytest.mark.parametrize("damping", [0.0, 0.3])
+def test_a_factor_by_blocks_solves_the_normal_equations(seen, stereo, damping: float) -> None:
+    rng = np.random.default_rng(5)
+    names, data, _ = gather_data(seen[:4], stereo)
+    state = bent(State.from_stereo(stereo, names, len(data.points)), rng)
+    residuals = tuple(rng.normal(size=p.shape) for p in predict_observations(state, data))
+    A, b = normal_equations(state, data, residuals, tuple(rng.random(r.shape) for r in residuals))
+    Prior.build(state, data).add(A, b, state, (10.0, 20.0))
+    before, at = A.copy(), state.layout
+    others = rng.normal(size=(at.size, 2))
+    factor = BlockFactor(A, at, damping)
+    assert np.array_equal(A, before)
+    A = np.triu(A) + np.triu(A, 1).T
+    rig = np.arange(at.rig, at.camera_field)
+    A[rig, rig] *= 1 + damping
+    solution = np.column_stack([factor.solve(b), factor.solve(others)])
+    scale = np.sqrt(np.diag(A))[:, None]
+    residual = A @ solution - np.column_stack([b, others])
+    assert (np.abs(residual / scale).max(axis=0) < 1e-9 * np.abs(scale * solution).max(axis=0)).all()
 
 
 def _every(samples, n):

@@ -5,14 +5,19 @@ from functools import partial
 
 import numba
 import numpy as np
-from scipy.linalg import cho_solve, lapack
 from threadpoolctl import threadpool_limits
 
 from slviewer.calibration.observe import Observation
 from slviewer.calibration.splined.board_shape import board_frame
 from slviewer.calibration.splined.bundle import Bundle, PoseFit
 from slviewer.calibration.splined.half_turns import detect_half_turns, is_numbering_ambiguous, renumber_poses
-from slviewer.calibration.splined.normal import PoseData, normal_equations, predict_observations
+from slviewer.calibration.splined.normal import (
+    BlockFactor,
+    PoseData,
+    factorize,
+    normal_equations,
+    predict_observations,
+)
 from slviewer.calibration.splined.prior import Prior
 from slviewer.calibration.splined.residual_noise import Noise, estimate_noise, pose_sigmas, pose_trust, robust_weights
 from slviewer.calibration.splined.unknowns import State
@@ -111,18 +116,17 @@ def _adjust(
         if step > 2:
             is_excluded |= (pose_trust(weights, sigmas, data) < MIN_TRUST).any(axis=1)
         _zero_weights(weights, is_excluded, data)
-        sum_information = partial(_sum_information, state, data, residuals, weights, prior, strengths)
-        A, b = sum_information()
-        factor = _cholesky(A)
+        A, b = normal_equations(state, data, residuals, weights)
+        prior.add(A, b, state, strengths)
+        factor = BlockFactor(A, layout)
         count = int(sum(np.count_nonzero(w) for w in weights))
         cost = partial(_cost, weights=weights, prior=prior, strengths=strengths)
-        system = sum_information, b, _inverse(factor)(b)
-        state, residuals, move, damping = _take_step(state, residuals, data, cost, system, damping)
+        state, residuals, move, damping = _take_step(state, residuals, data, cost, (A, b, factor.solve(b)), damping)
         moved = float(np.sqrt(max(move @ b, 0.0) / count))
         if progress:
             progress(step / (step + 3))
         if moved < 0.3 and updates < STRENGTH_STEPS:
-            strengths = prior.update_strengths(strengths, state, _inverse(factor))
+            strengths = prior.update_strengths(strengths, state, factor.solve)
             updates += 1
         elif moved < CONVERGENCE_SIGMAS:
             break
@@ -155,25 +159,10 @@ def _adjust(
         depth_range_mm=_depth_range(state, data, is_excluded),
         camera_poses=camera_poses,
         projector_poses=projector_poses,
-        packed_factor=_pack_factor(factor[layout.rig :, layout.rig :]),
+        packed_factor=_pack_factor(factorize(A)[layout.rig :, layout.rig :]),
         steps=step,
         half_turned_poses=tuple(name for name, flag in zip(names, half_turned, strict=True) if flag),
     )
-
-
-def _sum_information(
-    state: State,
-    data: PoseData,
-    residuals: tuple[np.ndarray, np.ndarray],
-    weights: tuple[np.ndarray, np.ndarray],
-    prior: Prior,
-    strengths: Sequence[float],
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the information matrix (N, N) with the prior's, of which the upper triangle is filled, and the right-hand
-    side (N,)."""
-    A, b = normal_equations(state, data, residuals, weights)
-    prior.add(A, b, state, strengths)
-    return A, b
 
 
 def _residuals(state: State, data: PoseData) -> tuple[np.ndarray, np.ndarray]:
@@ -202,25 +191,20 @@ def _take_step(
     residuals: tuple[np.ndarray, np.ndarray],
     data: PoseData,
     cost: Callable[[State, tuple[np.ndarray, np.ndarray]], float],
-    system: tuple[Callable[[], tuple[np.ndarray, np.ndarray]], np.ndarray, np.ndarray],
+    system: tuple[np.ndarray, np.ndarray, np.ndarray],
     damping: float,
 ) -> tuple[State, tuple[np.ndarray, np.ndarray], np.ndarray, float]:
     """Take a Gauss-Newton step; damp it where it does not lower the cost.
 
-    ``system``: function that returns the information matrix, right-hand side, and full step. Only lenses and relative
-    pose are damped: together with the fields they have a curved valley of the cost at strong distortion. Returns the
-    new state, its residuals, the step, and the damping; the unchanged state where no damping helps.
+    ``system``: information matrix, right-hand side, and full step. Only lenses and relative pose are damped: together
+    with the fields they have a curved valley of the cost at strong distortion. Returns the new state, its residuals,
+    the step, and the damping; the unchanged state where no damping helps.
     """
-    sum_information, b, full = system
-    layout, before = state.layout, cost(state, residuals)
-    rig = np.arange(layout.rig, layout.camera_field)
+    A, b, full = system
+    before = cost(state, residuals)
     damping = damping / DAMPING_STEP if damping > LEAST_DAMPING else 0.0
     while damping < MOST_DAMPING:
-        move = full
-        if damping:
-            A, _ = sum_information()  # anew: the first was overwritten by its factor
-            A[rig, rig] *= 1 + damping
-            move = _inverse(_cholesky(A))(b)
+        move = BlockFactor(A, state.layout, damping).solve(b) if damping else full
         after = state.step(move)
         new = _residuals(after, data)
         if cost(after, new) <= before * (1 + 1e-9):  # False for NaN
@@ -229,27 +213,9 @@ def _take_step(
     return state, residuals, full, damping
 
 
-def _cholesky(A: np.ndarray) -> np.ndarray:
-    """Return the lower Cholesky factor of a matrix given by its upper triangle in C order; overwrites A.
-
-    Raises CalibrationRejected where the matrix is not positive definite.
-    """
-    factor, failed = lapack.dpotrf(A.T, lower=1, clean=0, overwrite_a=1)
-    if failed:
-        raise CalibrationRejected(
-            "the poses leave the joint adjustment undetermined: capture the board in more positions and tilts"
-        )
-    return np.asarray(factor)
-
-
 def _pack_factor(factor: np.ndarray) -> np.ndarray:
     """Return the lower triangle of a factor as a flat float32 array."""
     return np.asarray(factor[np.tri(len(factor), dtype=bool)], np.float32)
-
-
-def _inverse(factor: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-    """Return a function that solves the factorised system for a vector or for columns."""
-    return lambda right: np.asarray(cho_solve((factor, True), right, check_finite=False))
 
 
 def _sigmas(

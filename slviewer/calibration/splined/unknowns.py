@@ -72,6 +72,12 @@ class UnknownLayout:
         """Number of unknowns."""
         return self.projector_field + 2 * self.projector_knots
 
+    @property
+    def separable(self) -> tuple[slice, ...]:
+        """Blocks of which no two share an observation or a prior: offsets, and u and v of the projector's field."""
+        v = self.projector_field + self.projector_knots
+        return slice(self.offsets, self.rig), slice(self.projector_field, v), slice(v, self.size)
+
 
 @dataclass(frozen=True, eq=False)
 class State:
