@@ -157,6 +157,8 @@ def main(arguments: list[str] | None = None) -> int:
         )
     except SystemExit as stop:
         return int(stop.code or 0)
+    except BrokenPipeError:  # the help is piped into `head`
+        return 1
     try:
         run()
     except SlviewerError as error:

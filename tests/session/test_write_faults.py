@@ -1,19 +1,15 @@
 """Wherever the program is killed while it writes, or the disk refuses: nothing saved is lost, and work goes on."""
 
-import builtins
-import errno
-import io
-import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+from faults import FAULTS, KILL, Disk, Killed, watching
 
 from slviewer.errors import SessionError
 from slviewer.fringe.patterns import render
@@ -26,94 +22,18 @@ from slviewer.session.capture import NewCapture
 from slviewer.session.lock import WriterLock
 from slviewer.session.store import Session
 
-KILL = 0
-FAULTS = {"kill": KILL, "disk full": errno.ENOSPC, "I/O error": errno.EIO, "read-only": errno.EROFS}
-
-
-class Killed(BaseException):
-    """Stands for `kill -9`: from then on the program changes nothing on disk any more."""
-
-
-class Disk:
-    """Counts the calls that change the disk, and fails at one: once (EIO), from then on, or by the program's death."""
-
-    def __init__(self, at: int | None, code: int = KILL) -> None:
-        self.calls: list[str] = []
-        self._at, self._code = at, code
-        self._dead = False
-
-    def call(self, name: str) -> None:
-        """Count a call; raises the fault where it is due."""
-        number = len(self.calls)
-        self.calls.append(name)
-        if self._dead or (self._code == KILL and number == self._at):
-            self._dead = True
-            raise Killed
-        if self._at is None or number < self._at or self._code == KILL:
-            return
-        is_growing = name in ("open", "write", "mkdir", "fsync")
-        if (self._code == errno.EIO and number > self._at) or (self._code == errno.ENOSPC and not is_growing):
-            return
-        raise OSError(self._code, os.strerror(self._code))
-
-    def write(self, file: Any, data: Any) -> int:
-        """Write to a file, half of the data where the disk fails."""
-        try:
-            self.call("write")
-        except BaseException:
-            file.write(memoryview(data).cast("B")[: memoryview(data).nbytes // 2] if not isinstance(data, str) else "")
-            raise
-        return int(file.write(data))
-
-
-class WatchedFile:
-    """A file opened for writing, whose writes are counted."""
-
-    def __init__(self, file: Any, disk: Disk) -> None:
-        self._file, self._disk = file, disk
-
-    def write(self, data: Any) -> int:
-        return self._disk.write(self._file, data)
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._file, name)
-
-    def __enter__(self) -> "WatchedFile":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._file.close()
-
 
 @contextmanager
 def faulty(disk: Disk) -> Iterator[None]:
     """Context manager: everything that changes files is counted by the disk; locks of the dead are released after."""
     locks: list[WriterLock] = []
-    opened = builtins.open
-
-    def watched(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
-        def call(*arguments: Any, **options: Any) -> Any:
-            disk.call(name)
-            return function(*arguments, **options)
-
-        return call
-
-    def watched_open(path: Any, mode: str = "r", *arguments: Any, **options: Any) -> Any:
-        if not set(mode) & set("wxa+"):
-            return opened(path, mode, *arguments, **options)
-        disk.call("open")
-        return WatchedFile(opened(path, mode, *arguments, **options), disk)
 
     class Lock(WriterLock):
         def __init__(self, folder: Path) -> None:
             super().__init__(folder)
             locks.append(self)
 
-    with pytest.MonkeyPatch.context() as patch:
-        for name in ("rename", "replace", "fsync", "mkdir", "unlink", "rmdir"):
-            patch.setattr(os, name, watched(name, getattr(os, name)))
-        patch.setattr(builtins, "open", watched_open)
-        patch.setattr(io, "open", watched_open)
+    with watching(disk) as patch:
         patch.setattr(store, "WriterLock", Lock)
         try:
             yield
