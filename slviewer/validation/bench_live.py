@@ -51,8 +51,9 @@ class LiveFigures:
     one that has stalled.
 
     Captures a second before and after that; clouds a second decoded, reconstructed and sent to the viewer that draws;
-    `latency_ms`: the median from the first frame's light until a cloud is sent, NaN where none was; `growth_mb`: how
-    much more memory the program used in the last quarter than in the second, None where the system does not report it.
+    `latency_ms`: the median from the first frame's light until a cloud is sent, NaN where none was. `growth_mb`,
+    `growth_files`, `growth_threads`: how much more memory, open files and threads the program had in the last quarter
+    than in the second, None where the system does not report it.
     """
 
     size: tuple[int, int]
@@ -64,6 +65,8 @@ class LiveFigures:
     latency_ms: float
     points: int
     growth_mb: float | None
+    growth_files: float | None
+    growth_threads: float | None
 
     def to_json(self) -> dict[str, Any]:
         """Return the figures by name."""
@@ -71,12 +74,14 @@ class LiveFigures:
 
     def text(self) -> str:
         """Return the figures as lines for the terminal."""
-        growth = "unknown" if self.growth_mb is None else f"{self.growth_mb:+.1f} MB"
+        growth = "memory unknown"
+        if self.growth_mb is not None:
+            growth = f"memory {self.growth_mb:+.1f} MB, files {self.growth_files:+g}, threads {self.growth_threads:+g}"
         return (
             f"live at {self.size[0]}x{self.size[1]} for {self.seconds:.0f} s: {self.shown_per_s:.1f} clouds/s sent to "
             f"a viewer, {self.latency_ms:.0f} ms behind the light ({self.clouds_per_s:.1f}/s made of {self.points:,} "
             f"points); captures {self.captures_per_s:.1f}/s, beside a stalled viewer "
-            f"{self.captures_per_s_stalled:.1f}/s; memory {growth}"
+            f"{self.captures_per_s_stalled:.1f}/s; {growth}"
         )
 
 
@@ -103,7 +108,7 @@ def _measure(operator: Operator, server: SafeServer, seconds: float, progress: P
     """Figures of the running live scan over so many seconds, with a second viewer that stops reading."""
     time.sleep(_WARM_S)
     begun, first = time.monotonic(), operator.live_captures
-    memory: list[tuple[float, float]] = []
+    used: list[tuple[float, tuple[float, ...]]] = []
     made, shown, behind, points = [], [], [], 0
     with contextlib.ExitStack() as stack:
         stalled: _Viewer | None = None
@@ -120,13 +125,15 @@ def _measure(operator: Operator, server: SafeServer, seconds: float, progress: P
             shown.append(live.shown_per_s)
             behind += [] if live.latency_ms is None else [live.latency_ms]
             points = live.points
-            memory.append((passed / seconds, _measure_memory_mb()))
+            used.append((passed / seconds, _measure_use()))
             progress(min(passed / seconds, 0.999), f"live: {live.shown_per_s:.1f} clouds/s")
     captures = operator.live_captures
     camera = operator.snapshot().rig.camera
     assert camera is not None
-    quarter, last = ([mb for share, mb in memory if low < share <= low + 0.25] for low in (0.25, 0.75))
-    known = bool(quarter and last) and not np.isnan(memory[0][1])
+    growth: list[float | None] = [None] * 3
+    quarter, last = ([use for share, use in used if low < share <= low + 0.25] for low in (0.25, 0.75))
+    if quarter and last and not np.isnan(used[0][1]).any():
+        growth = (np.median(last, axis=0) - np.median(quarter, axis=0)).tolist()
     return LiveFigures(
         size=camera,
         seconds=seconds,
@@ -136,7 +143,9 @@ def _measure(operator: Operator, server: SafeServer, seconds: float, progress: P
         shown_per_s=statistics.median(shown),
         latency_ms=statistics.median(behind) if behind else float("nan"),
         points=points,
-        growth_mb=statistics.median(last) - statistics.median(quarter) if known else None,
+        growth_mb=growth[0],
+        growth_files=growth[1],
+        growth_threads=growth[2],
     )
 
 
@@ -241,10 +250,10 @@ def _get_last_notice(operator: Operator) -> str:
     return notices[-1].text if notices else "nobody said why"
 
 
-def _measure_memory_mb() -> float:
-    """Memory in use by this process, MB; NaN where the system does not report it."""
+def _measure_use() -> tuple[float, float, float]:
+    """Memory, MB, open files and threads of this process; NaN where the system does not report them."""
     try:
-        pages = int(Path("/proc/self/statm").read_text().split()[1])
+        pages, files = int(Path("/proc/self/statm").read_text().split()[1]), len(list(Path("/proc/self/fd").iterdir()))
     except OSError:
-        return float("nan")
-    return pages * resource.getpagesize() / 1e6
+        return (float("nan"),) * 3
+    return pages * resource.getpagesize() / 1e6, files, threading.active_count()

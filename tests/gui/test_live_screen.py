@@ -59,7 +59,10 @@ def test_the_rate_is_measured_beside_a_stalled_viewer(monkeypatch: pytest.Monkey
     assert found.size == (240, 180) and found.points > 3000
     assert found.captures_per_s + found.captures_per_s_stalled > 0
     assert found.clouds_per_s > 0 and found.shown_per_s > 0 and found.latency_ms > 1
-    assert set(found.to_json()) > {"latency_ms", "growth_mb"} and "240x180" in found.text()
+    assert (
+        set(found.to_json()) > {"latency_ms", "growth_mb", "growth_files", "growth_threads"}
+        and "240x180" in found.text()
+    )
 
 
 def test_a_cloud_is_thinned_evenly_to_what_a_screen_takes() -> None:
