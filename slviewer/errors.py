@@ -51,6 +51,10 @@ class DeviceError(SlviewerError):
     """A camera or projector that does not answer, was unplugged, or cannot do what was requested."""
 
 
+class TurntableError(DeviceError):
+    """A turntable that did not reach its angle; camera and projector are not affected."""
+
+
 class CalibrationRejected(SlviewerError):
     """A calibration that was computed, or could not be, and must not be used."""
 

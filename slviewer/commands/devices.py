@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from slviewer import terminal
-from slviewer.commands.command import JSON, Option, call, write_json
+from slviewer.commands.command import JSON, Option, call, show_result, write_json
 from slviewer.errors import DeviceError, InputError, UsageError
 
 if TYPE_CHECKING:
@@ -39,6 +39,12 @@ def run_capture(capture: Callable[..., Any], arguments: dict[str, Any]) -> None:
     with _serve_projector_page(arguments.pop("port")) as set_up:
         saved = call(capture, set_up=set_up, say=terminal.print_result, **arguments)
     terminal.print_result(summarise_capture(saved))
+
+
+def run_turn(turn: Callable[..., Any], arguments: dict[str, Any]) -> None:
+    """Scan all round, and show what was made."""
+    with _serve_projector_page(arguments.pop("port")) as set_up:
+        show_result(turn, {**arguments, "set_up": set_up})
 
 
 def run_preflight(check_rig: Callable[..., Any], arguments: dict[str, Any]) -> None:

@@ -8,7 +8,7 @@ from functools import cache
 from importlib.util import find_spec
 
 import slviewer.devices
-from slviewer.devices.protocols import Camera, Projector, Rig
+from slviewer.devices.protocols import Camera, Projector, Rig, Turntable
 from slviewer.errors import DeviceError, InputError
 
 
@@ -17,9 +17,9 @@ class Driver:
     """A driver of devices; its factories take the driver's options, and import vendor packages when called.
 
     `what`: in a few words, what it drives. `packages`: how to install each package that must be importable, such as
-    ``{"harvesters": "pip install 'slviewer[genicam]'"}``. A driver offers cameras, projectors, whole rigs (where both
-    devices share something), or several of these. `channel`: its factories also take the keyword `channel`, the wire to
-    the projector page. `list_connected` returns a line per connected device.
+    ``{"harvesters": "pip install 'slviewer[genicam]'"}``. A driver offers cameras, projectors, turntables, whole rigs
+    (where both devices share something), or several of these. `channel`: its factories also take the keyword `channel`,
+    the wire to the projector page. `list_connected` returns a line per connected device.
     """
 
     name: str
@@ -29,6 +29,7 @@ class Driver:
     camera: Callable[..., Camera] | None = None
     projector: Callable[..., Projector] | None = None
     rig: Callable[..., Rig] | None = None
+    turntable: Callable[..., Turntable] | None = None
     channel: bool = False
     list_connected: Callable[[], Sequence[str]] | None = None
 

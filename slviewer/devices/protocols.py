@@ -1,10 +1,10 @@
-"""Protocols of cameras and projectors: as little as a structured-light rig needs.
+"""Protocols of cameras, projectors and turntables: as little as a structured-light rig needs.
 
 A device belongs to the thread that opened it. Every method raises `DeviceError` when the device does not answer, is not
 open or was unplugged; after that, `close` and `open` are the way back, and `close` never raises.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Literal, Protocol, runtime_checkable
@@ -80,6 +80,9 @@ class ColourCamera(Camera, Protocol):
         ...
 
 
+_MAX_ANGLE_DEG = 1e5
+"""What the controllers of turntables count exactly."""
+
 Channel = Literal["red", "green", "blue", "grey"]
 """What a colour camera decodes; green has the most pixels under a Bayer mosaic, and the most light of most lamps."""
 
@@ -129,17 +132,62 @@ class Projector(Protocol):
         ...
 
 
+class Turntable(Protocol):
+    """Turns what stands before the rig about an axis; `name` and `limits_deg` can be read before it is open.
+
+    Its errors are `TurntableError`: the rig can capture without it.
+    """
+
+    @property
+    def name(self) -> str:
+        """The operator's name for it, to start a sentence with."""
+        ...
+
+    @property
+    def limits_deg(self) -> tuple[float, float] | None:
+        """The angles between which it turns; None: without end."""
+        ...
+
+    @property
+    def is_absolute(self) -> bool:
+        """Whether it still knows its angle after it was switched off."""
+        ...
+
+    def open(self) -> None:
+        """Claim the device, without turning it. It keeps the angle that it stands at where it knows it, else 0."""
+        ...
+
+    def close(self) -> None:
+        """Stop, and release the device; nothing happens when it is not open."""
+        ...
+
+    def position_deg(self) -> float:
+        """Read the angle that it stands at, as far as the device knows it."""
+        ...
+
+    def turn_to(self, deg: float, check: Callable[[], None] = lambda: None) -> None:
+        """Turn to an angle by the way in between, of several turns too, and return when it stands still.
+
+        `check()` is called while it turns, and may raise (Cancelled), which stops it. Raises InputError for an angle
+        outside its limits, TurntableError where it raises an alarm, stops before the angle, takes too long or was
+        unplugged; it is then told to stop.
+        """
+        ...
+
+
 @dataclass(frozen=True)
 class Rig:
     """A camera and a projector that view the same scene, under the name that the operator chose.
 
     `settle_ms` passes between "shown" and the grab: the measured delay of the light after the projector's report.
+    A `turntable` is opened by what uses it: captures do not need it.
     """
 
     name: str
     camera: Camera
     projector: Projector
     settle_ms: float = 0.0
+    turntable: Turntable | None = None
 
     @contextmanager
     def opened(self) -> Iterator["Rig"]:
@@ -186,6 +234,13 @@ def check_sequence(projector: Projector, sequence: PatternSequence) -> None:
         raise InputError(
             f"the patterns are {w}x{h} px and {projector.name} has {columns}x{rows}: make them for this projector"
         )
+
+
+def check_angle(turntable: Turntable, deg: float) -> None:
+    """Raise InputError unless the turntable can turn to the angle."""
+    low, high = turntable.limits_deg or (-_MAX_ANGLE_DEG, _MAX_ANGLE_DEG)
+    if not low <= deg <= high:
+        raise InputError(f"{turntable.name} turns from {low:g} to {high:g} degrees, not to {deg:g}: choose others")
 
 
 def check_index(projector: Projector, sequence: PatternSequence | None, index: int) -> PatternSequence:

@@ -1,11 +1,23 @@
-"""Simulated camera and projector: drivers that capture the content of a `SimulatedWorld`."""
+"""Simulated camera, projector and turntable: drivers that capture the content of a `SimulatedWorld`."""
+
+from collections.abc import Callable
+from typing import Annotated
 
 import cv2
+import msgspec
 import numpy as np
 
 from slviewer.devices.drivers import Driver
 from slviewer.devices.opening import Openable
-from slviewer.devices.protocols import CameraSettings, Rig, check_frame, check_index, check_level, check_sequence
+from slviewer.devices.protocols import (
+    CameraSettings,
+    Rig,
+    check_angle,
+    check_frame,
+    check_index,
+    check_level,
+    check_sequence,
+)
 from slviewer.devices.world import Shown, SimulatedWorld
 from slviewer.errors import InputError
 from slviewer.fringe.patterns import profile
@@ -123,6 +135,43 @@ class SimulatedProjector(Openable):
         self.world.shown = Shown(pattern, lamp, seed, preview)
 
 
+class SimulatedTurntable(Openable):
+    """Turns what stands before the simulated rig; each stop is off by a normal error of `repeatability_deg`.
+
+    The stone takes the place of a board, plate or ball, which show nothing when turned round.
+    """
+
+    limits_deg = None
+    is_absolute = True
+
+    def __init__(
+        self, world: SimulatedWorld, repeatability_deg: Annotated[float, msgspec.Meta(ge=0, le=10)] = 0.02
+    ) -> None:
+        super().__init__("the simulated turntable")
+        self.world, self._repeatability_deg = world, repeatability_deg
+        self._position_deg = world.table_deg
+        self._rng = np.random.default_rng((world.rig.seed, 0x7A))
+
+    def open(self) -> None:
+        """Open the turntable, with something on it."""
+        super().open()
+        if self.world.standing in ("board", "plane", "sphere"):
+            self.world.place("stone")
+
+    def position_deg(self) -> float:
+        """Return the nominal angle."""
+        self.check_open()
+        return self._position_deg
+
+    def turn_to(self, deg: float, check: Callable[[], None] = lambda: None) -> None:
+        """Turn at once, nearly to the angle."""
+        self.check_open()
+        check_angle(self, deg)
+        check()
+        self.world.turn_table(deg + self._repeatability_deg * float(self._rng.standard_normal()))
+        self._position_deg = deg
+
+
 def simulated_rig(world: SimulatedWorld) -> Rig:
     """Return the camera and projector that view `world`."""
     return Rig("simulated", SimulatedCamera(world), SimulatedProjector(world))
@@ -135,7 +184,12 @@ def preset_rig(preset: str = "letter", scale: float = 1.0, seed: int = 0, board:
     return simulated_rig(SimulatedWorld(letter(scale, seed), Board.parse(board)))
 
 
-DRIVER = Driver("simulated", "a rig that exists in numbers only, with known truth", rig=preset_rig)
+DRIVER = Driver(
+    "simulated",
+    "a rig that exists in numbers only, with known truth, and a turntable before it",
+    rig=preset_rig,
+    turntable=SimulatedTurntable,
+)
 
 
 def _estimate_white_level(renderer: Renderer) -> float:

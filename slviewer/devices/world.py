@@ -14,12 +14,13 @@ from slviewer.simulation.mesh import MeshScene, demo_object
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import SimulatedRig
 from slviewer.simulation.scenes import Scene, Spheres, sphere
+from slviewer.simulation.turning import turn_pose, turning
 from slviewer.target.board import Board
 
-Thing = Literal["board", "plane", "sphere", "object"]
-"""The printed target, the blank plate, the Letter's sphere, the demo object."""
+Thing = Literal["board", "plane", "sphere", "object", "stone"]
+"""The printed target, the blank plate, the Letter's sphere, the demo object, the stone on the turntable."""
 
-_INITIAL_DEPTHS_MM: dict[Thing, float] = {"board": 600.0, "plane": 600.0, "sphere": 690.0, "object": 600.0}
+_INITIAL_DEPTHS_MM = {"board": 600.0, "plane": 600.0, "sphere": 690.0, "object": 600.0}
 _SETTLED_S = 0.3  # a thing that has not been moved for so long is rendered in full by a preview too
 _DRAFT_SCALE = 0.25  # of a preview while things move: the geometry of 400x300 rays instead of 1600x1200
 
@@ -54,6 +55,7 @@ class SimulatedWorld:
             "sphere": sphere((0.0, 0.0, _INITIAL_DEPTHS_MM["sphere"])),
         }
         self._standing: Thing = "board"
+        self._table_deg = 0.0
         self._moved = time.monotonic()
         self._renderers: dict[bool, Renderer] = {}
         self.print_board(board or Board.parse("circles:21x16:9"), shape)
@@ -108,7 +110,7 @@ class SimulatedWorld:
         if pose is not None and not (np.isfinite(pose.R).all() and np.isfinite(pose.t).all()):
             raise InputError("a pose with numbers that are not finite places nothing: give a turn and mm")
         with self._lock:
-            scene = self._things[thing] if thing in self._things else demo_object(_make_initial_pose(thing))
+            scene = self._things[thing] if thing in self._things else _make_scene(thing)
             if pose is not None:
                 scene = _move_scene(scene, pose)
             self._standing = thing
@@ -125,6 +127,17 @@ class SimulatedWorld:
             more = 0.0 if turn_deg is None else np.radians(turn_deg - self.turn_deg)
             R = np.array([[np.cos(more), 0, np.sin(more)], [0, 1, 0], [-np.sin(more), 0, np.cos(more)]])
             self.place(self._standing, Pose(R @ pose.R, t))
+
+    @property
+    def table_deg(self) -> float:
+        """The angle that the turntable stands at."""
+        return self._table_deg
+
+    def turn_table(self, deg: float) -> None:
+        """Turn the table to an angle, and with it the thing in view, about the axis of `simulation.turning`."""
+        with self._lock:
+            self._table_deg, change_deg = deg, deg - self._table_deg
+            self.place(self._standing, turn_pose(self.pose, change_deg))
 
     def renderer(self, preview: bool) -> Renderer:
         """Return a renderer of the scene; for previews soon after a motion, one of a smaller camera scale."""
@@ -165,6 +178,11 @@ def _move_scene(scene: Scene, pose: Pose) -> Scene:
         return replace(scene, centres=pose.t[None].astype(float))
     assert isinstance(scene, BoardScene | MeshScene)
     return replace(scene, pose=pose)
+
+
+def _make_scene(thing: Thing) -> Scene:
+    """Return the scene of the demo object, or of the stone on the turntable, at its initial pose."""
+    return demo_object(_make_initial_pose(thing)) if thing == "object" else turning(1)["turn_01"]
 
 
 def _make_initial_pose(thing: Thing) -> Pose:

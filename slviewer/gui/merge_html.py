@@ -49,9 +49,9 @@ def merge_failure_html(why: str, labels: Mapping[str, str], merge: MergeView | N
     return alert(Html(f"<b>Not merged.</b> {to_html(use_labels(why, labels) + still)}"), "error")
 
 
-def turntable_html(names: Sequence[str], step_deg: float, labels: Mapping[str, str]) -> Html:
+def turntable_html(names: Sequence[str], table_deg: Sequence[float], labels: Mapping[str, str]) -> Html:
     """List the turntable angle of each scan."""
-    turned = [f"{_get_label(name, labels)} at {k * step_deg:g}°" for k, name in enumerate(names)]
+    turned = [f"{_get_label(name, labels)} at {deg:g}°" for name, deg in zip(names, table_deg, strict=True)]
     if len(turned) > 4:
         turned = [*turned[:3], "…", turned[-1]]
     note = "Direction and axis of the turntable are estimated."

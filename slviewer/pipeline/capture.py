@@ -5,19 +5,23 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from slviewer.devices.capture import CapturedFrames, capture_with_texture, check_exposures
 from slviewer.devices.protocols import CameraSettings, Rig
 from slviewer.errors import InputError, SessionError, SlviewerError
 from slviewer.fringe.presets import PRESETS
-from slviewer.fringe.sequence import PatternSequence
+from slviewer.fringe.sequence import Axis, PatternSequence
+from slviewer.geometry.rig import StereoRig
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings, part
 from slviewer.pipeline.frame_check import save_check
 from slviewer.pipeline.open_session import opened_or_made
 from slviewer.pipeline.rig_choice import RigSetup, SetUp, set_up
 from slviewer.pipeline.rig_presets import RigLike, load_rig
 from slviewer.pipeline.suggest_exposure import BUDGET_S, MAX_SUGGESTED, apply_suggestion, suggest_exposure
+from slviewer.records import to_plain
 from slviewer.session.atomic import format_bytes
-from slviewer.session.capture import Capture, Role
+from slviewer.session.capture import Capture, Role, TurnStep
 from slviewer.session.names import safe_name
 from slviewer.session.store import Session
 from slviewer.target.board import Board
@@ -86,7 +90,7 @@ def capture(
         bench = set_up(choice, target)
         sequence = choose_sequence(bench, patterns)
         most = MAX_SUGGESTED if auto_exposure else max(1, len(exposures))
-        _check_disk_space(store, bench, len(sequence.frames) * most)
+        check_disk_space(store, bench, len(sequence.frames) * most)
         begin = 0.3 if auto_exposure else 0.0
         with bench.rig.opened() as devices:
             set_camera(devices, choice, exposure_ms, gain, warn)
@@ -146,6 +150,12 @@ def choose_sequence(bench: RigSetup, patterns: str) -> PatternSequence:
     return PRESETS[patterns](bench.rig.projector.size)
 
 
+def depth_axis(rig: StereoRig) -> Axis:
+    """Return the axis along which the projector's coordinate changes more with depth."""
+    shift = np.abs(np.diag(rig.projector.K)[:2] * rig.t[:2])
+    return "x" if shift[0] >= shift[1] else "y"
+
+
 def save_frames(
     store: Session,
     name: str,
@@ -156,9 +166,11 @@ def save_frames(
     source: str,
     purpose: str,
     board: str | None = None,
+    turn_step: TurnStep | None = None,
     force: bool = False,
 ) -> Capture:
     """Save captured frames with their sequence, settings and texture; returns the stored capture."""
+    turned = {} if turn_step is None else {"turntable": to_plain(turn_step)}
     exposure = {} if captured.exposures_ms else {"exposure_ms": captured.settings.exposure_ms}
     return store.save_capture(
         name,
@@ -167,14 +179,14 @@ def save_frames(
         captured.frames,
         source=source,
         texture=captured.texture,
-        settings={"purpose": purpose, **exposure, "gain": captured.settings.gain},
+        settings={"purpose": purpose, **exposure, "gain": captured.settings.gain, **turned},
         board=board,
         exposures_ms=captured.exposures_ms,
         force=force,
     )
 
 
-def _check_disk_space(store: Session, bench: RigSetup, frames: int) -> None:
+def check_disk_space(store: Session, bench: RigSetup, frames: int) -> None:
     """Raise SessionError before anything is captured that the disk would refuse."""
     (width, height), dtype = bench.rig.camera.size, bench.rig.camera.dtype
     needed, free = frames * width * height * dtype.itemsize, shutil.disk_usage(store.folder).free

@@ -9,9 +9,9 @@ from slviewer.pipeline.rig_presets import rigs
 
 @dataclass(frozen=True)
 class DriverView:
-    """One driver: what it drives and offers ("camera", "projector", "rig"), what is connected, a line each (None where
-    nobody looked, and `trouble` may say why), what it needs, and what this machine lacks for it with how to install it,
-    empty if nothing.
+    """One driver: what it drives and offers ("camera", "projector", "turntable", "rig"), what is connected, a line each
+    (None where nobody looked, and `trouble` may say why), what it needs, and what this machine lacks for it with how to
+    install it, empty if nothing.
     """
 
     name: str
@@ -46,7 +46,7 @@ def devices() -> str:
 
 def _view_driver(driver: Driver) -> DriverView:
     """Return a driver's entry of the list, with its connected devices or the error that listing them raised."""
-    offers = tuple(part for part in ("camera", "projector", "rig") if getattr(driver, part) is not None)
+    offers = tuple(part for part in ("camera", "projector", "turntable", "rig") if getattr(driver, part) is not None)
     connected, trouble = None, ""
     if driver.list_connected is not None and not driver.missing:
         try:

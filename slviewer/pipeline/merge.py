@@ -168,9 +168,10 @@ def merge(
         reference: The capture whose frame the merged cloud takes.
         out: PLY file. Without it the session stores the merge as merge/1 and so on, for mesh, compare, measure and
             export, and its file is in the session's exports.
-        start: Initial alignment: features estimates it from the scans; turntable uses --angle; identity assumes that
-            the scans are nearly aligned already; placed takes the places that `align` found.
-        angle: Degrees that the turntable turns from each capture to the next, with --start turntable.
+        start: Initial alignment: features estimates it from the scans; turntable uses the angles of the turntable;
+            identity assumes that the scans are nearly aligned already; placed takes the places that `align` found.
+        angle: Degrees that the turntable turns from each capture to the next, with --start turntable; by default as
+            stored with the captures of `slviewer turn`.
         model: Which calibration to use; by default the best one available.
         accept_rejected: Use the calibration although its verdict rejects it.
 
@@ -188,11 +189,11 @@ def merge(
         if out.suffix.lower() != ".ply":
             raise UsageError(f"merged points are written as .ply, not as {out.name}: a mesh goes into other files too")
         out.parent.mkdir(parents=True, exist_ok=True)
-    if start != "placed":
-        starts = _initial_alignments(names, start, angle, axis, poses, picked, warn)
     with opened(session, write=out is None) as store:
         if start == "placed":
-            starts = _initial_alignments(names, "identity", angle, axis, _load_places(store, names), picked, warn)
+            poses = _load_places(store, names)
+        table_deg = _list_table_angles(store, names, start, angle)
+        starts = _initial_alignments(names, start, table_deg, axis, poses, picked, warn)
         check_accepted(store, accept_rejected)
         fitted = load_model(store, model or preferred_model(store))
         warn_if_stale(store, warn)
@@ -278,18 +279,46 @@ def merge_record(store: Session, merged: Merge, model: str) -> dict[str, Any]:
     }
 
 
+def _list_table_angles(
+    store: Session, names: Sequence[str], start: StartKind, angle: float | None
+) -> dict[str, float] | None:
+    """Return the turntable's angle of each scan, or None where the initial alignment is another.
+
+    Without the ``angle`` of a step, the stored ones of a single turn. Raises UsageError where these are missing.
+    """
+    if start != "turntable":
+        if angle is not None:
+            raise UsageError(
+                "an angle from scan to scan is that of a turntable: give --start turntable too, or neither"
+            )
+        return None
+    if angle is not None:
+        return {name: angle * k for k, name in enumerate(names)}
+    stored = {name: store.load_capture(name).turn_step for name in names}
+    table_deg = {name: step.deg for name, step in stored.items() if step is not None}
+    if missing := [name for name in names if name not in table_deg]:
+        raise UsageError(
+            f"no angle of a turntable is stored with {', '.join(missing)}: give the angle from scan to scan, or start "
+            "from features"
+        )
+    if len(turns := dict.fromkeys(step.turn for step in stored.values() if step is not None)) > 1:
+        raise UsageError(
+            f"the scans belong to several turns ({', '.join(turns)}), between which the object may have been moved: "
+            "start from features"
+        )
+    return table_deg
+
+
 def _initial_alignments(
     names: Sequence[str],
     start: StartKind,
-    angle: float | None,
+    table_deg: Mapping[str, float] | None,
     axis: TurntableAxis | None,
     poses: Mapping[str, np.ndarray] | None,
     picked: Picked | None,
     warn: Warn,
 ) -> Starts:
     """Return the initial alignments for the requested start; raises for options that do not fit it."""
-    if (start == "turntable") != (angle is not None):
-        raise UsageError("a turntable's start needs its angle from scan to scan: give both, or neither")
     if start == "identity" and poses is None:
         poses = {name: np.eye(4) for name in names}
     picks = {}
@@ -298,10 +327,10 @@ def _initial_alignments(
             raise UsageError(f"points were picked on {scan} and {onto}, which are not both among the scans to merge")
         picks[scan, onto], apart = fit_picked_start(there, here)
         warn(f"{scan} -> {onto}: the picked points come within {apart.max():.2f} mm of each other")
-    for base in {onto for _, onto in picks} if poses is None and angle is None else ():
+    for base in {onto for _, onto in picks} if poses is None and table_deg is None else ():
         if all((name, base) in picks for name in names if name != base):  # pairs without picked points start there too
             poses = {base: np.eye(4)} | {name: picks[name, base].T for name in names if name != base}
-    return Starts(poses=poses, step_deg=angle, axis=axis, picked=picks)
+    return Starts(poses=poses, table_deg=table_deg, axis=axis, picked=picks)
 
 
 def _registration_figures(registration: Registration) -> dict[str, Any]:

@@ -60,9 +60,10 @@ def mesh(
         session: Session folder.
         names: One scan; several, to be merged into the frame of the first; or a merge of the session, as merge/1.
         out: The file; by default a .ply in the session's exports.
-        start: Initial alignment of several scans: features estimates it from the scans; turntable uses --angle;
-            identity assumes that they are nearly aligned already.
-        angle: Degrees that the turntable turns from each scan to the next, with --start turntable.
+        start: Initial alignment of several scans: features estimates it from the scans; turntable uses the angles of
+            the turntable; identity assumes that they are nearly aligned already.
+        angle: Degrees that the turntable turns from each scan to the next, with --start turntable; by default as stored
+            with the captures of `slviewer turn`.
         model: Which calibration to use; by default the best one available.
         accept_rejected: Use the calibration although its verdict rejects it.
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from slviewer.devices.channel import Channel
 from slviewer.devices.drivers import Driver, driver, drivers
-from slviewer.devices.protocols import Rig
+from slviewer.devices.protocols import Rig, Turntable
 from slviewer.devices.simulated import simulated_rig
 from slviewer.devices.world import SimulatedWorld
 from slviewer.errors import InputError
@@ -20,9 +20,9 @@ from slviewer.target.board import Board
 
 Choice = Mapping[str, Any]
 
-COMMON_KEYS = ("name", "settle_ms", "focal_px", "exposure_ms", "gain")
+COMMON_KEYS = ("name", "settle_ms", "focal_px", "exposure_ms", "gain", "turntable")
 """Keys that a choice may hold for any rig: its name, the delay of its light, the nominal focal length of its lens
-in camera px, and what its camera is set to by default."""
+in camera px, what its camera is set to by default, and its turntable."""
 
 
 @dataclass(frozen=True)
@@ -46,6 +46,30 @@ def set_up(choice: Choice, board: Board | None, *, channel: Channel | None = Non
 
     Raises InputError for an invalid choice, DeviceError for a driver that cannot be used here.
     """
+    bench = _set_up_devices(choice, board, channel)
+    if "turntable" not in choice:
+        return bench
+    return replace(bench, rig=replace(bench.rig, turntable=_set_up_turntable(choice["turntable"], bench.world)))
+
+
+def _set_up_turntable(choice: Choice, world: SimulatedWorld | None) -> Turntable:
+    """The turntable of a choice, not opened yet; a simulated one turns the thing in `world`."""
+    options = dict(choice)
+    try:
+        chosen = driver(str(options.pop("driver")))
+        if chosen.turntable is None:
+            raise InputError(f"the driver {chosen.name} offers no turntable: choose another")
+        if chosen.name != "simulated":
+            return chosen.turntable(**options)
+        if world is None:
+            raise InputError("a simulated turntable turns only what is before the simulated rig: choose another")
+        return chosen.turntable(world, **options)
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"the turntable {dict(choice)} cannot be set up ({error}): choose it again") from error
+
+
+def _set_up_devices(choice: Choice, board: Board | None, channel: Channel | None) -> RigSetup:
+    """Camera and projector of a choice, as `set_up` returns them."""
     options = {key: value for key, value in choice.items() if key not in (*COMMON_KEYS, "driver")}
     focal, settle_ms = choice.get("focal_px"), float(choice.get("settle_ms", 0.0))
     try:

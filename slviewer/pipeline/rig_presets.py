@@ -98,6 +98,8 @@ def check_choice(choice: Choice, where: str) -> None:
             raise InputError(f"{where}: {key} = {value!r} is no number above 0, up to {largest:g}: correct it")
     if not isinstance(choice.get("name", ""), str):
         raise InputError(f"{where}: name = {choice['name']!r} is no text: correct it")
+    if "turntable" in choice:
+        _check_device(choice, "turntable", where)
     if "driver" in choice:
         given = {key: value for key, value in choice.items() if key not in (*COMMON_KEYS, "driver")}
         if {"camera", "projector"} & set(given):
@@ -108,11 +110,17 @@ def check_choice(choice: Choice, where: str) -> None:
     if unknown:
         raise InputError(f"{where} has the unknown key {unknown[0]!r}: use camera, projector, {', '.join(COMMON_KEYS)}")
     for part in ("camera", "projector"):
-        device = choice.get(part)
-        if not isinstance(device, Mapping) or "driver" not in device:
-            raise InputError(f'{where} names no {part}: add [{part}] with driver = "…", or a driver of a rig')
-        options = {key: value for key, value in device.items() if key != "driver"}
-        _check_options(str(device["driver"]), part, options, f"{where}, {part}")
+        _check_device(choice, part, where)
+
+
+def _check_device(choice: Choice, part: str, where: str) -> None:
+    """Raise InputError unless a choice names a driver of the part (camera, projector or turntable) and its options."""
+    device = choice.get(part)
+    if not isinstance(device, Mapping) or "driver" not in device:
+        rather = "" if part == "turntable" else ", or a driver of a rig"
+        raise InputError(f'{where} names no {part}: add [{part}] with driver = "…"{rather}')
+    options = {key: value for key, value in device.items() if key != "driver"}
+    _check_options(str(device["driver"]), part, options, f"{where}, {part}")
 
 
 def _read_preset(name: str, path: Path) -> Preset:
@@ -147,7 +155,7 @@ def _check_options(name: str, part: str, options: Mapping[str, Any], where: str)
     if any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters):
         return
     # the program supplies these; they are no entries of a file
-    provided = ("board", *(("channel",) if drivers()[name].channel else ()))
+    provided = ("board", "world", *(("channel",) if drivers()[name].channel else ()))
     known = [parameter for parameter in parameters if parameter.name not in provided]
     accepted = [parameter.name for parameter in known]
     unknown = sorted(set(options) - set(accepted))
@@ -181,10 +189,9 @@ def _driver_factory(driver: Driver, part: str) -> Any:
 
 
 def _driver_names(choice: Choice) -> list[str]:
-    """Return the drivers of a choice: that of the whole rig, or those of camera and projector."""
-    if "driver" in choice:
-        return [str(choice["driver"])]
-    return [str(choice[part]["driver"]) for part in ("camera", "projector")]
+    """Return the drivers of a choice: that of the whole rig, or those of camera and projector, and of a turntable."""
+    whole = [str(choice["driver"])] if "driver" in choice else []
+    return whole + [str(choice[part]["driver"]) for part in ("camera", "projector", "turntable") if part in choice]
 
 
 def _list_names(session: Session | None) -> str:

@@ -18,6 +18,7 @@ from slviewer.preflight.recorded_capture import preflight_capture
 from slviewer.preflight.rig_under_test import RigUnderTest
 from slviewer.preflight.screen import check_pixels, check_screen
 from slviewer.preflight.stillness import check_motion
+from slviewer.preflight.turntable import check_turntable
 from slviewer.session.store import Session
 
 
@@ -31,7 +32,7 @@ def check_rig(
     progress: Progress = ignore_progress,
     warn: Warn = ignore_warnings,
 ) -> Preflight:
-    """Check a rig in about 10 s: right screen, delay, order of frames, light, stillness; or the frames of a capture.
+    """Check a rig in about 10 s: screen, delay, order of frames, light, stillness, turntable; or a capture's frames.
 
     Reports of each what is wrong, and what to do. Ends with status 1 where something is bad.
 
@@ -118,5 +119,8 @@ def preflight(rig: Rig, *, say: Callable[[str], None] | None = None, progress: P
     add(response, check_pixels(bench, middle), *check_order(bench))
     last_dark, last_white = (bench.grab_mean(grey, "what changed meanwhile", _AVERAGED_IMAGES) for grey in (None, 255))
     add(check_ambient(bench, last_dark), check_motion(bench, images, last_white))
+    if rig.turntable is not None:
+        tick("turning the turntable")
+        add(check_turntable(rig.turntable))
     heard(1.0, "checked")
     return Preflight(tuple(checks), settle_ms, levels, exposure_ms, time.monotonic() - began)

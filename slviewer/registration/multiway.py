@@ -27,7 +27,7 @@ from slviewer.registration.refine import Uncertainty
 from slviewer.registration.refusal import Refused
 from slviewer.registration.scan import Scan
 from slviewer.registration.start import Candidate, Start
-from slviewer.registration.turntable import TurntableAxis, fit_turntable_axis
+from slviewer.registration.turntable import TurntableAxis, determines_axis, fit_turntable_axis, shortest_turn
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -47,13 +47,13 @@ _LOOP_OVERLAP = 0.3
 class Starts:
     """Initial alignments of a multiway registration; by features where nothing is given.
 
-    ``poses``: approximate T_world_scan (4, 4) mm by name, in any common frame. ``step_deg``: a turntable's angle from
-    each scan to the next; ``axis``: its axis, None to estimate it from the first pairs. ``picked``: initial poses from
-    picked points, by pair.
+    ``poses``: approximate T_world_scan (4, 4) mm by name, in any common frame. ``table_deg``: the angle of a
+    turntable by name, of some of the scans at least; ``axis``: its axis, None to estimate it from the first pairs.
+    ``picked``: initial poses from picked points, by pair.
     """
 
     poses: Mapping[str, np.ndarray] | None = None
-    step_deg: float | None = None
+    table_deg: Mapping[str, float] | None = None
     axis: TurntableAxis | None = None
     picked: Mapping[Pair, Candidate] | None = None
 
@@ -176,24 +176,30 @@ class _PoseGraphBuilder:
         """Return T_world_scan (4, 4) mm by name from given poses or the turntable, and its origin; {} without these."""
         if self.starts.poses is not None:
             return {name: (np.asarray(T, dtype=np.float64), "initial") for name, T in self.starts.poses.items()}
-        step = self.starts.step_deg
-        if step is None:
+        if not self.starts.table_deg:
             return {}
-        axis = self.starts.axis or self._estimate_axis(step)
-        return {name: (axis.rotation(-step * k), "turntable") for k, name in enumerate(self.names)}
+        angles = {name: self.starts.table_deg[name] for name in self.names if name in self.starts.table_deg}
+        axis = self.starts.axis or self._estimate_axis(angles)
+        return {name: (axis.rotation(-deg), "turntable") for name, deg in angles.items()}
 
-    def _estimate_axis(self, step_deg: float) -> TurntableAxis:
-        """Estimate the turntable's axis from the first two consecutive pairs that register by features."""
-        steps = []
-        for before, name in pairwise(self.names):
-            if (registration := self._register((name, before))) is not None:
+    def _estimate_axis(self, angles: Mapping[str, float]) -> TurntableAxis:
+        """Estimate the turntable's axis from the first two consecutive pairs that register by features.
+
+        ``angles``: of the table, degrees, by name.
+        """
+        steps, steps_deg = [], []
+        given = {(b, a): shortest_turn(angles[b] - angles[a]) for a, b in pairwise(angles)}
+        usable = {pair: deg for pair, deg in given.items() if determines_axis(deg)} or given
+        for pair, deg in usable.items():
+            if (registration := self._register(pair)) is not None:
                 steps.append(registration.T_reference_scan)
+                steps_deg.append(deg)
             if len(steps) == 2:
                 break
         if not steps:
             raise Refused("overlap", "No two scans in a row register, so that the turntable's axis cannot be found: "
                           "give the axis, or scan at smaller steps.")  # fmt: skip
-        return fit_turntable_axis(steps, step_deg)
+        return fit_turntable_axis(steps, steps_deg)
 
     def _relative_pose(self, known: Mapping[str, tuple[np.ndarray, Start]], scan: str, onto: str) -> Candidate | None:
         """Return the initial pose of a pair from poses in a common frame; None where one of them is not known."""

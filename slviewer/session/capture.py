@@ -37,6 +37,31 @@ _FRAMES_IN_MEMORY = 8  # frames of an exposure that are in memory together while
 
 
 @dataclass(frozen=True)
+class TurnStep:
+    """One capture of a turn on a turntable: the turn's name, which step of how many, from 1, and the angle of a step.
+
+    Angles of one turn belong together; the object may have been moved between two turns. `position_deg` is what the
+    table itself counted there.
+    """
+
+    turn: str
+    step: Annotated[int, msgspec.Meta(ge=1)]
+    steps: Annotated[int, msgspec.Meta(ge=1)]
+    step_deg: float
+    position_deg: float = 0.0
+
+    @property
+    def deg(self) -> float:
+        """The angle of the table from the first step of the turn."""
+        return self.step_deg * (self.step - 1)
+
+    @property
+    def name(self) -> str:
+        """The name of the capture."""
+        return f"{self.turn}_{self.step:02d}"
+
+
+@dataclass(frozen=True)
 class Capture:
     """A saved capture; frames and texture stay on disk until they are read."""
 
@@ -81,6 +106,12 @@ class Capture:
     def exposures_ms(self) -> tuple[float, ...]:
         """The exposure times of a sequence that was captured repeatedly; empty for a single exposure."""
         return tuple(float(exposure) for exposure in self.meta.get("exposures_ms") or ())
+
+    @property
+    def turn_step(self) -> TurnStep | None:
+        """The step of a turn that it was captured at; None for other captures."""
+        stored = self.meta.get("settings", {}).get("turntable")
+        return None if stored is None else from_plain(stored, TurnStep)
 
     @property
     def exposure_choice(self) -> np.ndarray | None:
@@ -244,6 +275,8 @@ def read_capture(folder: Path) -> Capture:
     with decoding(folder / "capture.json"):
         described = from_plain(meta, _Description)
         sequence = _read_sequence(json.dumps(described.sequence))
+        if "turntable" in described.settings:
+            from_plain(described.settings["turntable"], TurnStep)
     return Capture(folder.name, described.role, sequence, described.camera.size, described.hash, folder, meta)
 
 

@@ -29,11 +29,16 @@ def turning(steps: int = STEPS) -> dict[str, MeshScene]:
     side = np.cross(AXIS, [0.0, 0.0, 1.0])
     side /= np.linalg.norm(side)
     upright = np.stack([side, np.cross(AXIS, side), AXIS], axis=1)
-    scenes = {}
-    for k in range(steps):
-        R = rotation(2 * np.pi * k / steps * AXIS) @ upright
-        scenes[f"turn_{k + 1:02d}"] = MeshScene(vertices, triangles, Pose(R, AXIS_POINT + R @ _AXIS_OFFSET_MM))
-    return scenes
+    first = Pose(upright, AXIS_POINT + upright @ _AXIS_OFFSET_MM)
+    return {
+        f"turn_{k + 1:02d}": MeshScene(vertices, triangles, turn_pose(first, 360.0 * k / steps)) for k in range(steps)
+    }
+
+
+def turn_pose(pose: Pose, deg: float) -> Pose:
+    """Return a pose on the table after it was turned by an angle."""
+    R = rotation(np.radians(deg) * AXIS)
+    return Pose(R @ pose.R, AXIS_POINT + R @ (pose.t - AXIS_POINT))
 
 
 @lru_cache(1)

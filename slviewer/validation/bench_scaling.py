@@ -149,7 +149,8 @@ def _time_scans(rig: SimulatedRig) -> list[Row]:
     def register(count: float) -> Callable[[], object]:
         """Return the registration of the first so many scans."""
         chosen = {name: clouds[name] for name in names[: int(count)]}
-        return lambda: register_all(chosen, names[0], Starts(step_deg=360.0 / steps))
+        angles = {name: 360.0 / steps * k for k, name in enumerate(chosen)}
+        return lambda: register_all(chosen, names[0], Starts(table_deg=angles))
 
     return _measure_growth("register scans of a turn", SCANS, register)
 

@@ -130,7 +130,8 @@ def prove_registration(
         return RegisteredScans(chosen, alignment, truth, perf_counter() - start)
 
     depths = register("object_", "object_r3", None, part(progress, 0.75, 0.8))
-    turn = register("turn_", "turn_01", Starts(step_deg=STEP_DEG), part(progress, 0.8, 0.88))
+    angles = {name: STEP_DEG * k for k, name in enumerate(name for name in scans if name.startswith("turn_"))}
+    turn = register("turn_", "turn_01", Starts(table_deg=angles), part(progress, 0.8, 0.88))
     checks = check_registration(depths, turn)
     progress(0.88, "fusing and meshing")
     surfaces, lines, surface_record = _check_surfaces(depths, turn, scans)

@@ -18,7 +18,7 @@ import numpy as np
 
 from slviewer.devices.capture import CapturedFrames, capture_with_texture
 from slviewer.devices.protocols import CameraSettings, Rig
-from slviewer.errors import Cancelled, DeviceError, SlviewerError
+from slviewer.errors import Cancelled, DeviceError, SlviewerError, TurntableError
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.pipeline.feedback import Progress
 from slviewer.wizard.live_frames import Stream
@@ -107,8 +107,9 @@ class Acquisition:
             self._view = RigView(light="white", capture=self._view.capture)
             if rig is not None:
                 self._view = replace(
-                    self._view, state="opening", name=rig.name, camera=rig.camera.size, projector=rig.projector.size
-                )
+                    self._view, state="opening", name=rig.name, camera=rig.camera.size, projector=rig.projector.size,
+                    turntable=rig.turntable.name if rig.turntable is not None else "",
+                )  # fmt: skip
             if self._thread is None and rig is not None:
                 self._thread = threading.Thread(target=self._serve, name="slviewer acquisition", daemon=True)
                 self._thread.start()
@@ -356,6 +357,8 @@ class Acquisition:
                 request.done(request.work(rig, self._report_stage))
         except Cancelled:
             self._notices.add("info", f"{request.name}: cancelled")
+        except TurntableError as error:  # camera and projector work without it
+            self._notices.add("error", f"{request.name}: {error}")
         except DeviceError:
             raise
         except SlviewerError as error:  # the disk or the patterns, not the devices

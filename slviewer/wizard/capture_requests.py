@@ -4,13 +4,10 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Literal
 
-import numpy as np
-
 from slviewer.devices.capture import CapturedFrames
 from slviewer.errors import DeviceError, InputError, SessionError
-from slviewer.fringe.sequence import Axis, PatternSequence, one_axis
-from slviewer.geometry.rig import StereoRig
-from slviewer.pipeline.capture import choose_sequence, save_frames
+from slviewer.fringe.sequence import PatternSequence, one_axis
+from slviewer.pipeline.capture import choose_sequence, depth_axis, save_frames
 from slviewer.session.atomic import format_bytes
 from slviewer.session.names import clean_label
 from slviewer.wizard.acquisition import CaptureRequest
@@ -162,9 +159,3 @@ def scan_sequence(engine: Engine) -> PatternSequence:
     if engine.bench is None or engine.bench.reel is not None:
         return sequence
     return one_axis(sequence, depth_axis(calibration.stereo.rig))  # half of the frames
-
-
-def depth_axis(rig: StereoRig) -> Axis:
-    """Return the axis along which the projector's coordinate changes more with depth."""
-    shift = np.abs(np.diag(rig.projector.K)[:2] * rig.t[:2])
-    return "x" if shift[0] >= shift[1] else "y"

@@ -6,8 +6,8 @@ from dataclasses import replace
 from slviewer.devices.capture import CapturedFrames
 from slviewer.errors import InputError
 from slviewer.fringe.presets import short
-from slviewer.pipeline.capture import save_frames
-from slviewer.wizard.capture_requests import CaptureRequests, depth_axis
+from slviewer.pipeline.capture import depth_axis, save_frames
+from slviewer.wizard.capture_requests import CaptureRequests
 from slviewer.wizard.live_scan import LiveCloud, LiveScan
 from slviewer.wizard.requests import request
 

@@ -1,16 +1,19 @@
 """Requests to merge scans, and to undo a merge."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
+from typing import TypeVar
 
 from slviewer.errors import InputError
 from slviewer.pipeline.merge import Picked, StartKind
 from slviewer.registration.refusal import Refused
 from slviewer.wizard import tasks
+from slviewer.wizard.jobs import Reporter
 from slviewer.wizard.notices import describe_error
 from slviewer.wizard.requests import RequestHandler, request
 
 MERGING = "Merging"
+T = TypeVar("T")
 _ALTERNATIVES = {
     "features": "Or use the initial alignment by picked points.",
     "placed": "Or use the initial alignment by features, or by picked points.",
@@ -38,23 +41,28 @@ class MergeRequests(RequestHandler):
 
         `undo_merge` undoes it. `start`, `angle` and `picked` as in `pipeline.merge`.
         """
-        engine = self._engine
-        store = engine.store
-        engine.set_merge_failure("")
+        store = self._engine.store
         chosen = [store.load_capture(name).name for name in names]
         merge = partial(
             tasks.merge_scans, store, chosen, reference, start=start, angle=angle, picked=picked, warn=self._warn
         )
 
+        self._submit_merge(merge, partial(tasks.describe_merge, reference), "picked" if picked else start)
+
+    def _submit_merge(self, merge: Callable[[Reporter], T], describe: Callable[[T], str], start: str) -> None:
+        """Queue a merge; `start` is its initial alignment, a key of the alternatives to it."""
+        engine = self._engine
+        engine.set_merge_failure("")
+
         def failed(error: BaseException) -> None:
             """Store and report why the merge failed, and suggest another initial alignment where that may help."""
             text = describe_error(MERGING, error)
             if isinstance(error, Refused) and error.reason in ("overlap", "disagree"):
-                text = f"{text} {_ALTERNATIVES['picked' if picked else start]}"
+                text = f"{text} {_ALTERNATIVES[start]}"
             engine.set_merge_failure(text)
             engine.notices.add("error", text)
 
-        self._submit(MERGING, merge, partial(tasks.describe_merge, reference), failed)
+        self._submit(MERGING, merge, describe, failed)
 
     @request("Undoing the merge")
     def undo_merge(self) -> None:

@@ -16,11 +16,11 @@ from slviewer.wizard.engine import Engine
 from slviewer.wizard.import_requests import ImportRequests
 from slviewer.wizard.live_requests import LiveRequests
 from slviewer.wizard.measure_requests import MeasureRequests
-from slviewer.wizard.merge_requests import MergeRequests
 from slviewer.wizard.requests import request
 from slviewer.wizard.rig_requests import RigRequests
 from slviewer.wizard.snapshot import Level, Notice, PreviewView, Snapshot
 from slviewer.wizard.surfaces import Surfaces
+from slviewer.wizard.turn_requests import TurnRequests
 
 
 class AutopilotLike(Protocol):
@@ -37,7 +37,7 @@ class AutopilotLike(Protocol):
         """Stop sending requests."""
 
 
-class Operator(RigRequests, LiveRequests, MergeRequests, MeasureRequests, ImportRequests):
+class Operator(RigRequests, LiveRequests, TurnRequests, MeasureRequests, ImportRequests):
     """The wizard: requests in, snapshots out. Close it, or use it in a `with` block."""
 
     def __init__(self, session: Path | str | None = None, rig: Choice | None = None, *, set_up: SetUp = set_up) -> None:

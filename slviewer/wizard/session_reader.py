@@ -400,6 +400,7 @@ class SessionReader:
             scale=meta.get("scale", ""),
             thumbnail=self._thumbnails.get(capture.hash, b""),
             placement=self._attempt(f"the place of {capture.name}", read, None),
+            turn_step=capture.turn_step,
         )
 
     def _read_placement(self, name: str, inputs: _Inputs) -> align.Placement | None:

@@ -16,6 +16,7 @@ from slviewer.pipeline.align import Placement
 from slviewer.pipeline.check_results import Preflight
 from slviewer.pipeline.suggest_exposure import ExposureSuggestion
 from slviewer.report.data import SpacingRow, VerificationView
+from slviewer.session.capture import TurnStep
 from slviewer.session.measurements import Measurement
 from slviewer.wizard.pose_plan import PlanInput, PosePlan
 
@@ -93,6 +94,7 @@ class RigView:
     choice: Mapping[str, Any] | None = None  # as the operator chose it
     needs_page: bool = False  # whether it needs the projector page
     notes: tuple[str, ...] = ()  # settings that its camera refused
+    turntable: str = ""  # its name; empty: the rig has none
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,6 +176,7 @@ class ScanView:
     masked: float | None = None  # share of the pixels outside the calibrated region; None: nothing is masked
     scale: str = ""  # the correction of scale in the cloud, in words
     placement: Placement | None = None  # among the scans that are aligned as they come; None: it was not tried
+    turn_step: TurnStep | None = None  # of a turn on a turntable
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,11 @@ All of them name their inputs, so that stale results are detected. The frames of
 by a job of their own (`engine`), which no cloud waits for.
 """
 
+from functools import partial
+
 import numpy as np
 
+from slviewer.errors import Cancelled, SlviewerError
 from slviewer.evaluation.crossvalidation import CrossValidation
 from slviewer.evaluation.plane import PlaneResult
 from slviewer.evaluation.sphere import SphereResult
@@ -22,14 +25,15 @@ from slviewer.pipeline.calibrate import CalibrationResult, calibrate
 from slviewer.pipeline.feedback import Warn
 from slviewer.pipeline.merge import Merge, Picked, StartKind, merge, merge_record
 from slviewer.pipeline.models import POSES_FOR_PIXELWISE, accepts_rejected, available_models, best_model
-from slviewer.pipeline.open_session import next_number
+from slviewer.pipeline.open_session import next_number, numbered_results
 from slviewer.pipeline.reconstruct import reconstruct
 from slviewer.pipeline.scale import scale_factor
+from slviewer.pipeline.turn import WATERTIGHT, align_turn
 from slviewer.pipeline.validate import validate
 from slviewer.pipeline.verify import Shape, verify
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.session.store import Session
-from slviewer.wizard.export_files import staged_export
+from slviewer.wizard.export_files import export_file, staged_export
 from slviewer.wizard.jobs import Reporter
 from slviewer.wizard.snapshot import Level
 
@@ -203,6 +207,32 @@ def merge_scans(
         session.guarded(report.saving).save_result(f"merge/{number}", merge_record(session, result, model), {})
     report(1.0, "merged")
     return result
+
+
+def merge_turn(session: Session, names: list[str], report: Reporter, warn: Warn) -> tuple[Merge, str]:
+    """Merge the scans of a turn by the angles of its turntable, and write a watertight mesh into the exports.
+
+    Returns the merge, and a sentence about the mesh; where it does not close, the merge stays.
+    """
+    report_merge = report.within(0, 0.7)
+    merged = align_turn(partial(merge_scans, session, names, names[0], report_merge, warn), warn)
+    number = numbered_results(session, "merge")[-1].removeprefix("merge/")
+    try:
+        words = export_file(session, "merged-mesh", number, "ply", WATERTIGHT, report.within(0.7, 1), warn)
+    except Cancelled:
+        raise
+    except SlviewerError as error:
+        words = "no watertight mesh was made"
+        warn(f"{words}: {error}")
+    report(1.0, "merged")
+    return merged, words
+
+
+def describe_turn(reference: str, result: tuple[Merge, str]) -> str:
+    """Describe the merge and the mesh of a turn in one sentence."""
+    merged, words = result
+    worst = max(merged.pairs.values(), key=lambda pair: pair.rms_mm)
+    return f"{len(merged.pairs) + 1} scans merged on {reference}, RMS up to {worst.rms_mm:.3f} mm; {words}"
 
 
 def describe_merge(reference: str, result: Merge) -> str:

@@ -127,7 +127,8 @@ def turned_scans(count: int, step: float) -> dict[str, Scan]:
 
 @pytest.fixture(scope="module")
 def turn() -> Alignment:
-    return register_all(turned_scans(6, 60.0), "turn_03", Starts(step_deg=60.0))
+    scans = turned_scans(6, 60.0)
+    return register_all(scans, "turn_03", Starts(table_deg=dict(zip(scans, 60.0 * np.arange(6), strict=True))))
 
 
 def test_a_turn_closes(turn: Alignment) -> None:

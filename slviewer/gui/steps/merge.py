@@ -130,6 +130,14 @@ class Panel(StepPanel):
         boxes, reference = self._boxes, self._reference.value
         return [s.name for s in scans if s.name == reference or (s.name in boxes and boxes[s.name].value)]
 
+    def _get_stored_angles(self, names: list[str]) -> list[float] | None:
+        """Return the angles, deg, that are stored with scans of one turn; None where they are of several or of none."""
+        session = self._snapshot.session if self._snapshot else None
+        scans = {scan.name: scan for scan in session.scans} if session else {}
+        steps = [step for name in names if (step := scans[name].turn_step) is not None]
+        same = len(steps) == len(names) and len({step.turn for step in steps}) == 1
+        return [step.deg for step in steps] if same else None
+
     def _get_shown_points(self) -> np.ndarray | None:
         """Return the shown points (n, 3) mm; None where none are."""
         if self._is_picking:
@@ -151,9 +159,11 @@ class Panel(StepPanel):
             names, start = self._list_chosen(), self._start.value
             versions = {scan.name: (scan.points, scan.model) for scan in session.scans if scan.cloud != "absent"}
             labels = {scan.name: scan.label for scan in session.scans}
-            change(self._angle, visible=start == TURNTABLE)
+            stored = self._get_stored_angles(names)
+            change(self._angle, visible=start == TURNTABLE and stored is None)
             if start == TURNTABLE:
-                self._start_note.set(turntable_html(names, float(self._angle.value), labels))
+                given = [k * float(self._angle.value) for k in range(len(names))]
+                self._start_note.set(turntable_html(names, given if stored is None else stored, labels))
             else:
                 self._start_note.write(_CURRENT_NOTE if start == CURRENT else "", "dim")
             chosen = {name: versions[name] for name in names}
@@ -217,7 +227,8 @@ class Panel(StepPanel):
             self._list_chosen(),
         )
         if start == TURNTABLE:
-            merge(names, reference, start="turntable", angle=float(self._angle.value))
+            stored = self._get_stored_angles(names) is not None
+            merge(names, reference, start="turntable", angle=None if stored else float(self._angle.value))
         elif start == PLACED:
             merge(names, reference, start="placed")
         elif start == CURRENT:

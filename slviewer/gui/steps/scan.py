@@ -15,6 +15,7 @@ from slviewer.gui.panel import PanelContext, StepPanel
 from slviewer.gui.preview import draw_preview, exposure_html, legend
 from slviewer.gui.simulated_object import SimulatedObject
 from slviewer.gui.steps.verify import MUCH_MASKED, shape_of
+from slviewer.gui.turning import TurnInputs
 from slviewer.gui.widgets import (
     Html,
     Picture,
@@ -80,7 +81,8 @@ class Panel(StepPanel):
                 "Save cloud", lambda: operator.save_live(self._label.value), viser.Icon.DOWNLOAD, "green", visible=False
             )
             self._live_status = Text(gui)
-            self._simulated = SimulatedObject(context, LAYER, ("object", "sphere", "plane"))
+            self._turn = TurnInputs(context)
+            self._simulated = SimulatedObject(context, LAYER, ("object", "stone", "sphere", "plane"))
         self._gallery = Text(gui)
         with gui.add_folder("Cloud", visible=False) as self._cloud_folder:
             self._scan = Choice(gui, "Scan")
@@ -126,6 +128,7 @@ class Panel(StepPanel):
             change(self._capture, disabled=not ready)
             self._draw_live(snapshot.live, ready)
             self._exposures.draw(snapshot)
+            self._turn.draw(snapshot, ready)
             self._simulated.draw(snapshot)
             self._import.draw(snapshot)
             self._restore.offer(session.deleted_scans if session else ())

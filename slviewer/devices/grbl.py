@@ -1,0 +1,339 @@
+"""A turntable whose motor is driven by G-code over a serial port: GRBL 1.1 and its descendants, or Marlin.
+
+GRBL: https://github.com/gnea/grbl/wiki/Grbl-v1.1-Interface and -Jogging. Marlin: https://marlinfw.org/meta/gcode.
+An alarm is never unlocked by itself: only who looks at the table knows that it may turn.
+"""
+
+import re
+import time
+from collections.abc import Callable, Sequence
+from typing import Annotated, Any, Literal
+
+import msgspec
+
+from slviewer.devices.drivers import Driver
+from slviewer.devices.opening import Openable
+from slviewer.devices.protocols import check_angle
+from slviewer.errors import InputError, TurntableError
+
+Dialect = Literal["auto", "grbl", "marlin"]
+Positive = Annotated[float, msgspec.Meta(gt=0, le=1e4)]
+
+BOOT_S = 6.0
+"""An Arduino restarts when its port is opened, and its boot loader then listens for about two seconds."""
+REPLY_S = 5.0
+"""How long a command may take to be accepted."""
+_ANSWER_S = 1.0  # to a question while it boots
+_POLL_S = 0.1
+_QUIET_S = 0.2
+_STOP_S = 2.0
+_TOLERANCE_DEG = 0.1
+_SPARE_S = 10.0  # that a motion may take longer than planned, beside twice the plan
+
+_CHECK_TABLE = "see that the table turns freely"
+_UNLOCK = "then unlock it with $X (or home it with $H) in a G-code sender"
+ALARMS = {
+    1: f"a limit switch was hit, and the position is lost: {_CHECK_TABLE}, set $21=0 if it has no switches, {_UNLOCK}",
+    2: f"the angle is outside its soft limits: set $20=0, as a turntable has no end, {_UNLOCK}",
+    3: f"it was reset while it turned, and the position is lost: {_CHECK_TABLE}, {_UNLOCK}",
+    4: f"a probe was in the wrong state: remove it, {_UNLOCK}",
+    5: f"a probe made no contact: remove it, {_UNLOCK}",
+    6: f"homing was reset: {_CHECK_TABLE}, {_UNLOCK}",
+    7: f"a door was opened during homing: close it, {_UNLOCK}",
+    8: f"homing did not leave the limit switch: check the switch, or set $22=0 if there is none, {_UNLOCK}",
+    9: f"homing did not reach a limit switch: check the switch, or set $22=0 if there is none, {_UNLOCK}",
+}
+"""What the alarms of GRBL 1.1 mean, and what to do."""
+
+ERRORS = {
+    1: "it received a damaged line: use a shorter, shielded cable",
+    2: "it received a damaged number: use a shorter, shielded cable",
+    3: "it does not know the command: its firmware must be GRBL 1.1 or newer",
+    5: "homing is not enabled: set $22=1 if the table has a switch",
+    7: "its settings could not be read and were reset: set the steps per unit ($100 for X) again",
+    8: "it is not idle: wait until it stands still, and end other programs that use it",
+    9: "it is locked by an alarm: look at the table, then unlock it with $X in a G-code sender",
+    10: "soft limits need homing: set $20=0, as a turntable has no end",
+    11: "the line is too long: it received something else too; end other programs that use the port",
+    12: "the step rate is too high: lower speed_deg_s",
+    13: "its safety door is open: close it",
+    15: "the angle is outside its soft limits: set $20=0, as a turntable has no end",
+    16: "it does not accept a jog: its firmware must be GRBL 1.1 or newer",
+    20: "it does not know the command: check `axis`, GRBL has X, Y and Z",
+    22: "the feed rate is missing or zero: set speed_deg_s",
+    33: "the motion is impossible: check `axis` and `degrees_per_unit`",
+}
+"""What the errors of GRBL 1.1 that may happen here mean, and what to do."""
+
+_BLOCKED = {
+    "Hold": "is paused: release the feed hold",
+    "Door": "reports an open safety door: close it",
+    "Check": "is in check mode, in which nothing moves: send $C in a G-code sender",
+    "Sleep": "sleeps: switch it off and on",
+}
+"""States of GRBL in which it does not turn."""
+
+
+class GcodeTurntable(Openable):
+    """A turntable on one axis of a GRBL or Marlin controller. It is open while its serial port is."""
+
+    is_absolute = False
+
+    def __init__(
+        self,
+        port: str,
+        baud: Annotated[int, msgspec.Meta(ge=1200, le=4_000_000)] = 115_200,
+        dialect: Dialect = "auto",
+        axis: Literal["X", "Y", "Z", "A", "B", "C", "E"] = "X",
+        degrees_per_unit: Annotated[float, msgspec.Meta(ge=-1e4, le=1e4)] = 1.0,
+        speed_deg_s: Positive = 20.0,
+        settle_ms: Annotated[float, msgspec.Meta(ge=0, le=60_000)] = 300.0,
+        limits_deg: Sequence[float] | None = None,
+        boot_s: Positive = BOOT_S,
+        reply_s: Positive = REPLY_S,
+    ) -> None:
+        """The controller at a serial port, such as /dev/ttyUSB0 or COM3.
+
+        `degrees_per_unit`: degrees that the table turns for one unit (mm) of the axis, 1 where the controller's steps
+        per mm were set to steps per degree; negative to reverse it. `settle_ms` passes after it stands still.
+        `boot_s`, `reply_s`: how long it may take to start, and to accept a command. Raises InputError.
+        """
+        if degrees_per_unit == 0:
+            raise InputError("degrees_per_unit = 0 turns nothing: give the degrees per unit of the axis")
+        if limits_deg is not None and not (len(limits_deg) == 2 and limits_deg[0] < limits_deg[1]):
+            raise InputError(f"limits_deg = {list(limits_deg)} are no limits: give two, the lower one first")
+        super().__init__(f"the turntable at {port}")
+        self.limits_deg = None if limits_deg is None else (float(limits_deg[0]), float(limits_deg[1]))
+        self._port, self._baud, self._dialect, self._axis = port, baud, dialect, axis
+        self._degrees_per_unit, self._speed_deg_s, self._settle_ms = degrees_per_unit, speed_deg_s, settle_ms
+        self._boot_s, self._reply_s = boot_s, reply_s
+        self._serial: Any = None
+        self._buffer = b""
+        self._unreadable = 0  # bytes that are no text, since it was opened
+        self._is_marlin = False
+
+    def open(self) -> None:
+        """Open the port, and wait for the controller. Raises TurntableError where it does not answer or is locked."""
+        import serial  # lazily: an optional package
+
+        super().open()
+        try:
+            try:
+                self._serial = serial.Serial(
+                    self._port, self._baud, timeout=0.05, write_timeout=self._reply_s, exclusive=True
+                )
+            except (OSError, ValueError) as error:
+                raise TurntableError(
+                    f"{self.name} cannot be opened ({error}): plug it in, end other programs that use it, and check "
+                    "the port; `slviewer devices` lists those that are connected"
+                ) from error
+            self._buffer, self._unreadable = b"", 0
+            self._is_marlin = self._probe() == "marlin"
+            self.position_deg()  # raises where it is locked
+        except BaseException:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """Close the port; a motion that was begun is stopped before that by `turn_to`."""
+        super().close()
+        port, self._serial = self._serial, None
+        if port is not None:
+            try:
+                port.close()
+            except OSError:  # it was unplugged
+                return
+
+    def position_deg(self) -> float:
+        """Ask the controller for the angle that it counts."""
+        self.check_open()
+        return (self._read_marlin() if self._is_marlin else self._read_grbl()[1]) * self._degrees_per_unit
+
+    def turn_to(self, deg: float, check: Callable[[], None] = lambda: None) -> None:
+        """Turn to an angle, wait until it stands still, and `settle_ms` more."""
+        self.check_open()
+        check_angle(self, deg)
+        change_deg = deg - self.position_deg()
+        units = change_deg / self._degrees_per_unit
+        feed = 60.0 * self._speed_deg_s / abs(self._degrees_per_unit)  # units a minute
+        end = time.monotonic() + 2.0 * abs(change_deg) / self._speed_deg_s + _SPARE_S * self._reply_s / REPLY_S
+        # Relative to what it counts now: the reported and the commanded angle may have different origins (G92, G54).
+        move = f"{self._axis}{units:.4f} F{feed:.2f}"
+        try:
+            check()
+            if self._is_marlin:
+                for line in ("G21", "G91", f"G1 {move}", "G90"):
+                    self._command(line)
+                self._command("M400", end, check)
+            else:
+                # A jog leaves the modes as they are, and is stopped without an alarm.
+                self._command(f"$J=G91 G21 {move}")
+                while self._read_grbl()[0] != "Idle":
+                    check()
+                    if time.monotonic() > end:
+                        raise TurntableError(f"{self.name} did not reach {deg:g} degrees in time: {_CHECK_TABLE}")
+                    time.sleep(_POLL_S)
+            reached_deg = self.position_deg()
+            if abs(reached_deg - deg) > max(_TOLERANCE_DEG, 0.01 * abs(self._degrees_per_unit)):
+                raise TurntableError(
+                    f"{self.name} stopped at {reached_deg:.2f} instead of {deg:g} degrees: {_CHECK_TABLE}, and end "
+                    "other programs that use it"
+                )
+        except BaseException:
+            self._stop()
+            raise
+        time.sleep(self._settle_ms / 1000)
+
+    def _probe(self) -> Dialect:
+        """Ask who is there until the controller answers. Raises TurntableError where it does not, or not readably."""
+        end = time.monotonic() + self._boot_s
+        while time.monotonic() < end:
+            for question, dialect, answer in (("$I", "grbl", "[VER:"), ("M115", "marlin", "FIRMWARE_NAME")):
+                if self._dialect not in ("auto", dialect):
+                    continue
+                self._write(f"{question}\n".encode())
+                until = min(end, time.monotonic() + _ANSWER_S * self._boot_s / BOOT_S)
+                while (line := self._read_line(until)) is not None:
+                    if answer in line:
+                        self._drain()
+                        return "grbl" if dialect == "grbl" else "marlin"
+                    if line.startswith(("ok", "error:")):
+                        break
+        if self._unreadable:
+            raise TurntableError(f"{self.name} sends unreadable characters at {self._baud} baud: set its own `baud`")
+        raise TurntableError(
+            f"{self.name} does not answer as {'GRBL or Marlin' if self._dialect == 'auto' else self._dialect} within "
+            f"{self._boot_s:g} s: switch it on, and check `port`, `baud` and `dialect`"
+        )
+
+    def _drain(self) -> None:
+        """Discard lines until none comes: late answers to earlier questions must not confirm a command."""
+        while self._read_line(time.monotonic() + _QUIET_S) is not None:
+            pass
+
+    def _command(self, command: str, end: float | None = None, check: Callable[[], None] = lambda: None) -> None:
+        """Send a line, and wait until it is accepted; `check()` is called meanwhile."""
+        self._write(f"{command}\n".encode())
+        end = time.monotonic() + self._reply_s if end is None else end
+        while time.monotonic() < end:
+            check()
+            line = self._read_line(min(end, time.monotonic() + _POLL_S))
+            if line is None:
+                continue
+            self._check_line(line, command)
+            if line.startswith("ok"):
+                return
+            if line.startswith("echo:busy") and command != "M400":  # it says every two seconds that it is alive
+                end = time.monotonic() + self._reply_s
+        raise TurntableError(
+            f"{self.name} did not confirm {command!r} in time: switch it off and on, and check its cable"
+        )
+
+    def _read_grbl(self) -> tuple[str, float]:
+        """Ask GRBL for its state and its axis, in units. Raises TurntableError in a state in which it cannot turn."""
+        self._write(b"?")
+        end = time.monotonic() + self._reply_s
+        while (line := self._read_line(end)) is not None:
+            if match := re.fullmatch(r"<(\w+)[^|]*\|[MW]Pos:([-\d.,]+)(\|.*)?>", line):
+                state, positions = match[1], match[2].split(",")
+                if state == "Alarm":
+                    raise TurntableError(f"{self.name} is locked by an alarm: {_CHECK_TABLE}, {_UNLOCK}")
+                if state in _BLOCKED:
+                    raise TurntableError(f"{self.name} {_BLOCKED[state]}")
+                index = "XYZABC".find(self._axis)
+                try:
+                    return state, float(positions[index] if index >= 0 else "")
+                except (IndexError, ValueError):
+                    raise TurntableError(
+                        f"{self.name} has no axis {self._axis}, it has {'XYZABC'[: len(positions)]}: set `axis`"
+                    ) from None
+            self._check_line(line, "?")
+        raise TurntableError(f"{self.name} did not report its state in time: switch it off and on, and check its cable")
+
+    def _read_marlin(self) -> float:
+        """Ask Marlin for the position of the axis, in units."""
+        self._write(b"M114\n")
+        end, position = time.monotonic() + self._reply_s, None
+        while (line := self._read_line(end)) is not None:
+            self._check_line(line, "M114")
+            match = re.search(rf"(?<!\w){self._axis}:\s*(-?\d+(?:\.\d+)?)", line.split("Count")[0])
+            position = float(match[1]) if match else position
+            if line.startswith("ok"):
+                if position is None:
+                    raise TurntableError(f"{self.name} has no axis {self._axis}: set `axis`")
+                return position
+        raise TurntableError(f"{self.name} did not report its angle in time: switch it off and on, and check its cable")
+
+    def _check_line(self, line: str, command: str) -> None:
+        """Raise TurntableError for a line that reports an alarm, an error or a restart."""
+        if match := re.match(r"ALARM:(\d+)", line):
+            number = int(match[1])
+            meaning = ALARMS.get(number, f"see the alarms of its firmware; {_CHECK_TABLE}, {_UNLOCK}")
+            raise TurntableError(f"{self.name} raised alarm {number}: {meaning}")
+        if match := re.match(r"error:(\d+)", line):
+            number = int(match[1])
+            meaning = ERRORS.get(number, "see the errors of its firmware")
+            raise TurntableError(f"{self.name} refused {command!r} with error {number}: {meaning}")
+        if line.startswith(("Error:", "!!")):
+            raise TurntableError(f"{self.name} reports {line!r}: correct that, and switch it off and on")
+        if line.startswith("Grbl ") or line == "start":
+            raise TurntableError(
+                f"{self.name} restarted: check its power supply and its cable; its count of the angle is lost"
+            )
+
+    def _stop(self) -> None:
+        """Stop a motion, as far as the controller still listens: it must not turn on unattended."""
+        try:
+            self._write(b"M410\n" if self._is_marlin else b"\x85")
+            end = time.monotonic() + _STOP_S
+            while not self._is_marlin and time.monotonic() < end and self._read_grbl()[0] != "Idle":
+                time.sleep(_POLL_S)
+        except TurntableError:  # what made it stop is reported
+            return
+
+    def _write(self, data: bytes) -> None:
+        """Send bytes. Raises TurntableError where the port is gone."""
+        try:
+            self._serial.write(data)
+        except OSError as error:  # also SerialException
+            raise self._describe_loss(error) from error
+
+    def _read_line(self, end: float) -> str | None:
+        """Return the next line without its end; None where none is complete at `end`, s of the monotonic clock."""
+        while True:
+            line, newline, rest = self._buffer.partition(b"\n")
+            if newline:
+                self._buffer = rest
+                text = line.strip(b"\r\x00 ")
+                if text and all(32 <= byte < 127 or byte == 9 for byte in text):
+                    return text.decode("ascii")
+                self._unreadable += len(text)
+                continue
+            if len(self._buffer) > 4096:  # no controller sends such lines
+                self._unreadable, self._buffer = self._unreadable + len(self._buffer), b""
+            if time.monotonic() >= end:
+                return None
+            try:
+                self._buffer += self._serial.read(max(1, self._serial.in_waiting))
+            except OSError as error:
+                raise self._describe_loss(error) from error
+
+    def _describe_loss(self, error: OSError) -> TurntableError:
+        """Return the error of a port that is gone."""
+        return TurntableError(f"{self.name} was unplugged ({error}): plug it in again")
+
+
+def list_connected() -> list[str]:
+    """List the serial ports of this machine, with what is behind them."""
+    from serial.tools.list_ports import comports
+
+    return [f"{port.device}: {port.description}" for port in comports()]
+
+
+DRIVER = Driver(
+    "grbl",
+    "a turntable on a GRBL or Marlin controller at a serial port",
+    packages={"serial": "pip install 'slviewer[turntable]'"},
+    turntable=GcodeTurntable,
+    list_connected=list_connected,
+)
