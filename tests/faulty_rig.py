@@ -3,16 +3,18 @@
 `breakable(rig)` wraps any rig; `Faults.plan` says what goes wrong at which frame of the next capture.
 """
 
+from collections.abc import Callable
 from typing import Literal, get_args
 
 import numpy as np
 
-from slviewer.devices.protocols import Camera, CameraSettings, Projector, Rig
-from slviewer.errors import DeviceError, InputError
+from slviewer.devices.protocols import Camera, CameraSettings, Projector, Rig, Turntable
+from slviewer.errors import DeviceError, InputError, TurntableError
 from slviewer.fringe.sequence import PatternSequence
 
-Fault = Literal["timeout", "unplugged", "projector"]
-"""The camera gives no frame once; the camera is gone until it is closed and opened; the same for the projector."""
+Fault = Literal["timeout", "unplugged", "projector", "turntable"]
+"""The camera gives no frame once; the camera is gone until it is closed and opened; the same for the projector; the
+turntable raises an alarm once."""
 
 
 class Faults:
@@ -24,7 +26,9 @@ class Faults:
         self.shown: int | None = None
 
     def plan(self, fault: Fault, frame: int) -> None:
-        """Let `fault` happen once, when frame `frame` of a sequence is shown; previews do not set it off."""
+        """Let `fault` happen once, when frame `frame` of a sequence is shown; previews do not set it off. That of the
+        turntable happens when it is to turn to `frame` degrees.
+        """
         if fault not in get_args(Fault):
             raise InputError(f"no fault is called {fault!r}: use one of {', '.join(get_args(Fault))}")
         self._planned = (fault, frame)
@@ -40,6 +44,12 @@ class Faults:
                 self._gone.add(device)
         if device in self._gone:
             raise DeviceError(f"the {device} does not answer: plug it in again and reconnect")
+
+    def strike_turntable(self, deg: float) -> None:
+        """Raise TurntableError if the turntable breaks at this angle."""
+        if self._planned is not None and self._planned[0] == "turntable" and deg >= self._planned[1]:
+            self._planned = None
+            raise TurntableError("the turntable raised alarm 1: see that the table turns freely")
 
     def restore(self, device: str) -> None:
         """What opening a device again does."""
@@ -113,7 +123,34 @@ class FaultyProjector:
         self._projector.show_level(grey)
 
 
+class FaultyTurntable:
+    """A turntable that works until its faults say otherwise."""
+
+    def __init__(self, table: Turntable, faults: Faults) -> None:
+        self._table, self._faults = table, faults
+        self.name, self.limits_deg, self.is_absolute = table.name, table.limits_deg, table.is_absolute
+
+    def open(self) -> None:
+        """Open the wrapped turntable."""
+        self._table.open()
+
+    def close(self) -> None:
+        """Close the wrapped turntable."""
+        self._table.close()
+
+    def position_deg(self) -> float:
+        """The wrapped turntable's."""
+        return self._table.position_deg()
+
+    def turn_to(self, deg: float, check: Callable[[], None] = lambda: None) -> None:
+        """Turn it, or the fault."""
+        self._faults.strike_turntable(deg)
+        self._table.turn_to(deg, check)
+
+
 def breakable(rig: Rig) -> tuple[Rig, Faults]:
     """`rig` with devices that can be broken, and the faults that break them."""
     faults = Faults()
-    return Rig(rig.name, FaultyCamera(rig.camera, faults), FaultyProjector(rig.projector, faults)), faults
+    table = None if rig.turntable is None else FaultyTurntable(rig.turntable, faults)
+    camera, projector = FaultyCamera(rig.camera, faults), FaultyProjector(rig.projector, faults)
+    return Rig(rig.name, camera, projector, turntable=table), faults

@@ -288,6 +288,7 @@ class GcodeTurntable(Openable):
             end = time.monotonic() + _STOP_S
             while not self._is_marlin and time.monotonic() < end and self._read_grbl()[0] != "Idle":
                 time.sleep(_POLL_S)
+            self._drain()
         except TurntableError:  # what made it stop is reported
             return
 

@@ -1,0 +1,220 @@
+"""A turn: planned, resumed where it was left, named where it fails, and closed to a watertight mesh by one command."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+from faulty_rig import breakable
+
+from slviewer.errors import Cancelled, DeviceError, InputError, TurntableError, UsageError
+from slviewer.pipeline.merge import merge
+from slviewer.pipeline.models import save_imported_stereo
+from slviewer.pipeline.rig_choice import Choice, RigSetup, set_up
+from slviewer.pipeline.turn import align_turn, capture_turn, missing_steps, next_turn, plan_turn, recorded_steps, turn
+from slviewer.registration.refusal import Refused
+from slviewer.session.capture import TurnStep
+from slviewer.session.store import Session
+from slviewer.session.toml import to_toml
+from slviewer.simulation.rig import letter
+from slviewer.simulation.truth import rig_record
+from slviewer.simulation.turning import stone, turning
+
+SCALE = 0.15
+RIG = {"driver": "simulated", "scale": SCALE, "turntable": {"driver": "simulated"}}
+TINY = {**RIG, "scale": 0.03}
+
+
+def calibrated(folder: Path, scale: float = SCALE) -> Path:
+    """A session whose calibration is the truth, but for the lenses' local distortion."""
+    rig = letter(scale)
+    record = rig_record(rig)
+    matrices = {f"{m}_{d}": np.array(record[d][m]) for m in ("K", "D") for d in ("camera", "projector")}
+    matrices |= {"R": np.array(record["R"]), "T": np.array(record["t"])}
+    with Session.create(folder) as store:
+        save_imported_stereo(store, matrices, source="truth", camera=rig.camera.size, projector=rig.projector.size)
+    return folder
+
+
+@pytest.mark.slow
+def test_one_command_makes_a_watertight_mesh_of_a_turned_object(tmp_path: Path, run: Callable[..., Any]) -> None:
+    session, rig, out = calibrated(tmp_path / "session"), tmp_path / "rig.toml", tmp_path / "stone.ply"
+    rig.write_text(to_toml(RIG))
+    status, text, error = run("turn", session, "--rig", rig, "--mesh", out, "--json", tmp_path / "turn.json")
+    assert status == 0, error
+    assert "12 scans all round" in text and "watertight" in text and "aligned by features instead" not in error
+    record = json.loads((tmp_path / "turn.json").read_text())
+    assert record["captures"] == {f"turn1_{k + 1:02d}": 30.0 * k for k in range(12)}
+    assert "turntable" in {pair["start"] for pair in record["merge"]["registered"]}
+    mesh = trimesh.load(out, process=False)
+    assert mesh.is_watertight
+    vertices, triangles = stone()
+    first = turning()["turn_01"].pose
+    truth = trimesh.Trimesh(first.to_camera(vertices), triangles, process=False)
+    assert mesh.volume == pytest.approx(truth.volume, rel=0.02)
+    measured = np.asarray(mesh.vertices)[::40]
+    foot = truth.vertices[vertices[:, 2] < vertices[:, 2].min() + 1e-6].mean(axis=0)
+    distance_mm = trimesh.proximity.closest_point(truth, measured)[1]
+    rms_mm = float(np.sqrt(np.mean(distance_mm**2)))
+    assert 0.02 < rms_mm < 0.5, rms_mm
+    assert np.percentile(distance_mm, 95) < 0.8
+    # the foot is closed where it is, not left open and not bulging
+    assert trimesh.proximity.closest_point(mesh, foot[None])[1][0] < 1.5
+
+
+def test_a_plan_is_a_full_turn_or_a_range() -> None:
+    full = plan_turn("turn1", 12)
+    assert [step.deg for step in full] == [30.0 * k for k in range(12)] and full[4].name == "turn1_05"
+    assert [step.deg for step in plan_turn("a", 4, -90.0)] == [0.0, -30.0, -60.0, -90.0]
+    assert plan_turn("a", 3, -360.0)[-1].deg == -240.0
+    for steps, range_deg in ((1, 360.0), (300, 360.0), (12, 0.0), (12, 361.0), (12, float("nan"))):
+        with pytest.raises(InputError):
+            plan_turn("a", steps, range_deg)
+    with pytest.raises(InputError):
+        plan_turn("../a")
+
+
+class Turned:
+    """Turns with a rig that can be broken, in a session of its own."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.warnings = folder, list[str]()
+        self.bench = set_up(TINY, None)
+        self.rig, self.faults = breakable(self.bench.rig)
+
+    def set_up(self, choice: Choice, board: object) -> RigSetup:
+        return RigSetup(self.rig, self.bench.world)
+
+    def __call__(self, progress: Callable[[float, str], None] = lambda share, doing: None, **options: Any) -> Any:
+        return turn(
+            self.folder, TINY, merge=False, set_up=self.set_up, progress=progress, warn=self.warnings.append, **options
+        )
+
+    def angles(self) -> dict[str, float]:
+        with Session.open(self.folder) as store:
+            return {c.name: c.turn_step.deg for c in store.captures("scan") if c.turn_step is not None}
+
+
+@pytest.fixture
+def turned(tmp_path: Path) -> Turned:
+    return Turned(tmp_path / "session")
+
+
+FOUR = {"turn1_01": 0.0, "turn1_02": 90.0, "turn1_03": 180.0, "turn1_04": 270.0}
+
+
+def test_a_fault_names_its_step_and_the_turn_goes_on_from_there(turned: Turned) -> None:
+    turned.faults.plan("turntable", 180)
+    with pytest.raises(TurntableError, match=r"step 3 of 4, at 180 degrees.*alarm 1.*2 scans are saved.*resume"):
+        turned(steps=4)
+    assert list(turned.angles()) == ["turn1_01", "turn1_02"]
+    turned.faults.plan("timeout", 3)
+    with pytest.raises(DeviceError, match=r"step 3 of 4.*frame.*2 scans are saved"):
+        turned(resume=True)
+    assert turned(resume=True).text().startswith("4 scans all round: turn1_01 to turn1_04")
+    assert turned.angles() == FOUR and turned.warnings == []
+    with pytest.raises(InputError, match="all 4 steps of turn1"):
+        turned(resume=True)
+    with pytest.raises(InputError, match="'turn1_01' already"):
+        turned(name="turn1")
+    turned(steps=2)
+    assert {"turn2_01", "turn2_02"} <= set(turned.angles())
+    # a scan that was deleted is a missing step
+    with Session.open(turned.folder, write=True) as store:
+        store.trash_capture("turn1_02")
+        assert [step.name for step in missing_steps(store, "turn1")] == ["turn1_02"] and next_turn(store) == "turn3"
+
+
+def test_a_cancelled_turn_keeps_what_was_captured(turned: Turned) -> None:
+    seen: list[str] = []
+
+    def cancel(share: float, doing: str) -> None:
+        seen.append(doing)
+        if "step 3 of 4: frame 2" in doing:
+            raise Cancelled("cancelled")
+
+    with pytest.raises(Cancelled):
+        turned(cancel, steps=4)
+    assert list(turned.angles()) == ["turn1_01", "turn1_02"] and "step 2 of 4: turning to 90 degrees" in seen
+    turned(resume=True)
+    assert turned.angles() == FOUR
+
+
+class Counting:
+    """A turntable that forgets its angle when it is switched off."""
+
+    name, limits_deg, is_absolute = "the counting table", None, False
+
+    def __init__(self, stands_at: float = 0.0) -> None:
+        self.counts, self.turned_to = stands_at, list[float]()
+
+    def open(self) -> None: ...
+
+    def close(self) -> None: ...
+
+    def position_deg(self) -> float:
+        return self.counts
+
+    def turn_to(self, deg: float, check: Callable[[], None] = lambda: None) -> None:
+        self.counts = deg
+        self.turned_to.append(deg)
+
+
+@pytest.mark.parametrize(
+    ("counts", "targets", "warned"), [(107.0, [137.0, 167.0], 0), (77.0, [137.0, 167.0], 0), (0.0, [30.0, 60.0], 1)]
+)
+def test_a_resumed_turn_goes_on_at_the_angle_where_it_stopped(counts: float, targets: list[float], warned: int) -> None:
+    """It began where the table counted 47 degrees; the last scan is that at 60 degrees."""
+    table, warnings, steps = Counting(counts), list[str](), plan_turn("turn1", 5, 120.0)
+    recorded = [TurnStep(s.turn, s.step, s.steps, s.step_deg, 47.0 + s.deg) for s in steps[:3]]
+    bench = set_up(TINY, None)
+    rig = type(bench.rig)("rig", bench.rig.camera, bench.rig.projector, turntable=table)
+    saved: list[TurnStep] = []
+    capture_turn(rig, steps[3:], lambda step, _: saved.append(step), recorded, warn=warnings.append)
+    assert table.turned_to == targets and len(warnings) == warned
+    assert [step.deg for step in saved] == [90.0, 120.0] and [step.position_deg for step in saved] == targets
+
+
+def test_angles_that_do_not_fit_the_scans_are_not_insisted_on() -> None:
+    warnings: list[str] = []
+
+    def attempt(start: str) -> str:
+        if start == "turntable":
+            raise Refused("overlap", "they do not overlap")
+        return start
+
+    assert align_turn(attempt, warnings.append) == "features" and "they do not overlap" in warnings[0]
+
+
+def test_merging_starts_from_stored_angles_of_one_turn_only(turned: Turned) -> None:
+    turned(steps=2)
+    turned(steps=2)
+    with Session.open(turned.folder, write=True) as store:
+        assert [step.deg for step in recorded_steps(store, "turn2")] == [0.0, 180.0]
+        capture = store.load_capture("turn1_01")
+        store.save_capture("plain", "scan", capture.sequence, capture.frames, source="x")
+        with pytest.raises(UsageError, match="plain"):
+            merge(store, ["turn1_01", "plain"], "turn1_01", start="turntable")
+        with pytest.raises(UsageError, match="turn1, turn2"):
+            merge(store, ["turn1_01", "turn2_02"], "turn1_01", start="turntable")
+        with pytest.raises(UsageError, match="turntable"):
+            merge(store, ["turn1_01", "turn1_02"], "turn1_01", angle=30.0)
+
+
+def test_what_cannot_be_turned_is_refused_before_anything_moves(tmp_path: Path) -> None:
+    plain = {"driver": "simulated", "scale": 0.03}
+    for rig, options, fact in (
+        (plain, {"merge": False}, "no turntable"),
+        (TINY, {}, "no calibration"),
+        (TINY, {"merge": False, "resume": True}, "no turn"),
+        ({"driver": "replay", "source": "x"}, {"merge": False}, "recording"),
+        (TINY, {"merge": False, "exposure_ms": 1.0, "exposures_ms": (1.0, 2.0)}, "several ways"),
+    ):
+        with pytest.raises(InputError, match=fact):
+            turn(tmp_path / "session", rig, **options)
+    with pytest.raises(UsageError, match="--mesh"):
+        turn(tmp_path / "session", TINY, merge=False, mesh=tmp_path / "a.ply")
+    assert not (tmp_path / "session").exists()

@@ -1,0 +1,104 @@
+"""Scanning all round as an operator asks for it: one request, then merge and mesh; cancelled, broken and resumed."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from faulty_rig import Faults, breakable
+
+from slviewer.pipeline.models import save_imported_stereo
+from slviewer.pipeline.rig_choice import Choice, RigSetup, set_up
+from slviewer.session.store import Session
+from slviewer.simulation.rig import letter
+from slviewer.simulation.truth import rig_record
+from slviewer.target.board import Board
+from slviewer.wizard import acquisition
+from slviewer.wizard.operator import Operator
+from slviewer.wizard.snapshot import Snapshot
+
+pytestmark = pytest.mark.slow
+
+SCALE = 0.12
+RIG = {"driver": "simulated", "scale": SCALE, "turntable": {"driver": "simulated"}}
+
+
+class Breakable:
+    """Sets rigs up as usual, with faults that can be planned."""
+
+    faults: Faults
+
+    def __call__(self, choice: Choice, board: Board | None) -> RigSetup:
+        bench = set_up(choice, board)
+        rig, self.faults = breakable(bench.rig)
+        return RigSetup(rig, bench.world, bench.focal_px)
+
+
+@pytest.fixture
+def rigs(monkeypatch: pytest.MonkeyPatch) -> Breakable:
+    monkeypatch.setattr(acquisition, "RETRY_S", 0.1)
+    return Breakable()
+
+
+@pytest.fixture
+def operator(tmp_path: Path, rigs: Breakable) -> Iterator[Operator]:
+    """With a calibration that is the truth, but for the lenses' local distortion."""
+    rig = letter(SCALE)
+    record = rig_record(rig)
+    matrices = {f"{m}_{d}": np.array(record[d][m]) for m in ("K", "D") for d in ("camera", "projector")}
+    matrices |= {"R": np.array(record["R"]), "T": np.array(record["t"])}
+    with Session.create(tmp_path / "session") as store:
+        save_imported_stereo(store, matrices, source="truth", camera=rig.camera.size, projector=rig.projector.size)
+    with Operator(tmp_path / "session", RIG, set_up=rigs) as operator:
+        assert operator.wait_for(lambda s: s.rig.state == "open", 20)
+        yield operator
+
+
+def turned(snapshot: Snapshot | None) -> list[tuple[str, float, str]]:
+    assert snapshot is not None and snapshot.session is not None
+    return [(s.name, s.turn_step.deg, s.cloud) for s in snapshot.session.scans if s.turn_step is not None]
+
+
+def test_one_request_ends_in_a_watertight_mesh(operator: Operator) -> None:
+    assert operator.snapshot().rig.turntable == "the simulated turntable"
+    stages: set[str] = set()
+    operator.subscribe(lambda s: stages.add(s.rig.capture.stage if s.rig.capture else ""))
+    assert operator.scan_all_round()
+    done = operator.wait_until_idle(280)
+    assert turned(done) == [(f"turn1_{k + 1:02d}", 30.0 * k, "fresh") for k in range(12)]
+    assert any(stage.startswith("step 3 of 12: frame") for stage in stages)
+    assert done.session is not None and done.session.merge is not None and done.merge_failure == ""
+    assert len(done.session.merge.scans) == 12 and operator.session is not None
+    (path,) = (operator.session.folder / "exports").glob("merged*mesh*.ply")
+    mesh = trimesh.load(path, process=False)
+    assert mesh.is_watertight and mesh.volume > 3e5
+    assert any(n.level == "good" and "watertight" in n.text for n in done.notices), [n.text for n in done.notices]
+
+
+def test_a_turn_that_fails_or_is_cancelled_is_resumed(operator: Operator, rigs: Breakable) -> None:
+    rigs.faults.plan("turntable", 240)
+    assert operator.scan_all_round(3, then_merge=False)
+    failed = operator.wait_until_idle(120)
+    assert [name for name, *_ in turned(failed)] == ["turn1_01", "turn1_02"]
+    errors = [n.text for n in failed.notices if n.level == "error"]
+    assert len(errors) == 1 and all(
+        fact in errors[0] for fact in ("step 3 of 3", "240", "alarm 1", "2 scans are saved")
+    )
+    assert failed.rig.state == "open" and failed.rig.fault == ""  # the camera goes on
+    assert operator.resume_turn(then_merge=False)
+    assert [deg for _, deg, _ in turned(operator.wait_until_idle(60))] == [0.0, 120.0, 240.0]
+    assert not operator.resume_turn() and "all 3 steps" in operator.notices()[-1].text
+    assert operator.scan_all_round(12, then_merge=False)
+    assert operator.wait_for(lambda s: s.rig.capture is not None and "step 2 of 12" in s.rig.capture.stage, 60)
+    assert operator.cancel()
+    cancelled = operator.wait_until_idle(120)
+    names = [name for name, *_ in turned(cancelled) if name.startswith("turn2")]
+    assert 1 <= len(names) < 12 and any("Scanning all round: cancelled" in n.text for n in cancelled.notices)
+    assert cancelled.session is not None and cancelled.session.merge is None
+
+
+def test_a_rig_without_a_turntable_says_so(operator: Operator) -> None:
+    assert operator.choose_rig({"driver": "simulated", "scale": SCALE})
+    assert operator.wait_for(lambda s: s.rig.state == "open" and not s.rig.turntable, 20)
+    assert not operator.scan_all_round() and "[turntable]" in operator.notices()[-1].text
