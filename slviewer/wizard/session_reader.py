@@ -59,7 +59,6 @@ from slviewer.wizard.surfaces import list_nominals
 from slviewer.wizard.tasks import missing_for_splined
 
 MOST_CACHED = 500
-
 T = TypeVar("T")
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from slviewer.calibration.diagnosis.verdict import Verdict
 from slviewer.calibration.next_pose import Coverage, Suggestion
 from slviewer.calibration.stereo import StereoModel
+from slviewer.devices.world import Thing
 from slviewer.evaluation.crossvalidation import CrossValidation
 from slviewer.pipeline.align import Placement
 from slviewer.pipeline.check_results import Preflight
@@ -268,7 +269,7 @@ class Space:
 class WorldView:
     """The simulated scene: the object in it, its T_camera_object (4, 4) mm, and its turn about the vertical."""
 
-    standing: Literal["board", "plane", "sphere", "object"]
+    standing: Thing
     T_camera_object: np.ndarray
     turn_deg: float
 

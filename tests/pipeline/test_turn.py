@@ -25,7 +25,7 @@ from slviewer.simulation.turning import stone, turning
 
 SCALE = 0.15
 RIG = {"driver": "simulated", "scale": SCALE, "turntable": {"driver": "simulated"}}
-TINY = {**RIG, "scale": 0.03}
+TINY = {**RIG, "scale": 0.05}
 
 
 def calibrated(folder: Path, scale: float = SCALE) -> Path:
@@ -205,7 +205,7 @@ def test_merging_starts_from_stored_angles_of_one_turn_only(turned: Turned) -> N
 
 
 def test_what_cannot_be_turned_is_refused_before_anything_moves(tmp_path: Path) -> None:
-    plain = {"driver": "simulated", "scale": 0.03}
+    plain = {"driver": "simulated", "scale": 0.05}
     for rig, options, fact in (
         (plain, {"merge": False}, "no turntable"),
         (TINY, {}, "no calibration"),
