@@ -136,10 +136,7 @@ class SimulatedProjector(Openable):
 
 
 class SimulatedTurntable(Openable):
-    """Turns what stands before the simulated rig; each stop is off by a normal error of `repeatability_deg`.
-
-    The stone takes the place of a board, plate or ball, which show nothing when turned round.
-    """
+    """Turns what stands before the simulated rig; each stop is off by a normal error of `repeatability_deg`."""
 
     limits_deg = None
     is_absolute = True
@@ -151,12 +148,6 @@ class SimulatedTurntable(Openable):
         self.world, self._repeatability_deg = world, repeatability_deg
         self._position_deg = world.table_deg
         self._rng = np.random.default_rng((world.rig.seed, 0x7A))
-
-    def open(self) -> None:
-        """Open the turntable, with something on it."""
-        super().open()
-        if self.world.standing in ("board", "plane", "sphere"):
-            self.world.place("stone")
 
     def position_deg(self) -> float:
         """Return the nominal angle."""

@@ -30,7 +30,7 @@ from slviewer.pipeline.mesh import MeshResult
 from slviewer.pipeline.mesh import mesh as mesh_merge
 from slviewer.pipeline.models import ModelName, check_accepted, load_model, load_stereo_if_complete, preferred_model
 from slviewer.pipeline.open_session import opened_or_made
-from slviewer.pipeline.rig_choice import SetUp, set_up
+from slviewer.pipeline.rig_choice import RigSetup, SetUp, set_up
 from slviewer.pipeline.rig_presets import RigLike, load_rig
 from slviewer.registration.multiway import MOST_SCANS
 from slviewer.registration.refusal import Refused
@@ -135,6 +135,7 @@ def turn(
         progress(0.0, "opening the devices")
         bench = set_up(choice, None)
         require_turntable(bench.rig)
+        place_object(bench)
         sequence = choose_sequence(bench, patterns)
         if (stereo := load_stereo_if_complete(store)) is not None:
             sequence = one_axis(sequence, depth_axis(stereo.rig))  # half of the frames
@@ -216,6 +217,12 @@ def missing_steps(store: Session, name: str | None = None) -> list[TurnStep]:
     if missing := [step for step in steps if step.name not in taken]:
         return missing
     raise InputError(f"all {first.steps} steps of {name} are captured: delete a scan to capture it again")
+
+
+def place_object(bench: RigSetup) -> None:
+    """Let the stone stand on the turntable before a simulated rig, where a board, plate or ball shows nothing."""
+    if bench.world is not None and bench.world.standing in ("board", "plane", "sphere"):
+        bench.world.place("stone")
 
 
 def require_turntable(rig: Rig) -> Turntable:

@@ -1,7 +1,7 @@
 """Does the turntable answer, turn, and come back?"""
 
 from slviewer.devices.protocols import Turntable
-from slviewer.errors import InputError, TurntableError
+from slviewer.errors import DeviceError, InputError
 from slviewer.pipeline.check_results import Check
 
 _TURN_DEG = 2.0
@@ -23,7 +23,7 @@ def check_turntable(table: Turntable) -> Check:
             figures = {"position_deg": round(begin_deg, 3), "error_deg": round(error_deg, 3)}
         finally:
             table.close()
-    except (InputError, TurntableError) as error:
+    except (InputError, DeviceError) as error:
         sentence, _, remedy = str(error).rpartition(": ")
         return Check("turntable", "bad", f"{sentence}.", f"{remedy[:1].upper()}{remedy[1:]}.", figures)
     if abs(error_deg) > _TOLERANCE_DEG:

@@ -16,6 +16,7 @@ from slviewer.pipeline.turn import (
     capture_turn,
     missing_steps,
     next_turn,
+    place_object,
     plan_turn,
     recorded_steps,
     require_turntable,
@@ -50,6 +51,7 @@ class TurnRequests(CaptureRequests, MergeRequests):
         exposures, recorded = engine.reader.exposures_ms(), recorded_steps(store, turn)
         frames = len(sequence.frames) * max(1, len(exposures))
         self._check_space(turn, frames * len(steps))
+        place_object(bench)
 
         def work(rig: Rig, progress: Progress) -> None:
             """Capture all steps into one buffer."""

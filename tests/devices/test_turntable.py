@@ -15,6 +15,7 @@ from slviewer.devices.world import SimulatedWorld
 from slviewer.errors import Cancelled, DeviceError, InputError, TurntableError
 from slviewer.pipeline.rig_choice import set_up
 from slviewer.pipeline.rig_presets import check_choice, load_rig
+from slviewer.pipeline.turn import place_object
 from slviewer.preflight.turntable import check_turntable
 from slviewer.simulation.rig import letter
 
@@ -206,8 +207,9 @@ def test_the_shipped_rig_has_a_turntable_with_something_to_see_on_it() -> None:
     bench = set_up(load_rig("turntable"), None)
     table, world = bench.rig.turntable, bench.world
     assert table is not None and world is not None and world.standing == "board"
-    table.open()
+    place_object(bench)
     assert world.standing == "stone"
+    table.open()
     before = world.pose
     table.turn_to(90.0)
     assert 0 < abs(world.table_deg - 90.0) < 0.2

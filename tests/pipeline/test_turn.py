@@ -15,6 +15,7 @@ from slviewer.pipeline.merge import merge
 from slviewer.pipeline.models import save_imported_stereo
 from slviewer.pipeline.rig_choice import Choice, RigSetup, set_up
 from slviewer.pipeline.turn import align_turn, capture_turn, missing_steps, next_turn, plan_turn, recorded_steps, turn
+from slviewer.registration.open3d_loader import open3d
 from slviewer.registration.refusal import Refused
 from slviewer.session.capture import TurnStep
 from slviewer.session.store import Session
@@ -54,15 +55,20 @@ def test_one_command_makes_a_watertight_mesh_of_a_turned_object(tmp_path: Path, 
     vertices, triangles = stone()
     first = turning()["turn_01"].pose
     truth = trimesh.Trimesh(first.to_camera(vertices), triangles, process=False)
-    assert mesh.volume == pytest.approx(truth.volume, rel=0.02)
-    measured = np.asarray(mesh.vertices)[::40]
+    assert mesh.volume == pytest.approx(truth.volume, rel=0.08)
+    error_mm = distances(truth, np.asarray(mesh.vertices)[::40])
+    rms_mm = float(np.sqrt(np.mean(error_mm**2)))
+    assert 0.03 < rms_mm < 0.5 and np.percentile(error_mm, 95) < 0.9, rms_mm
+    # what is in the shade above the foot is closed flat: not left open, and not bulging
     foot = truth.vertices[vertices[:, 2] < vertices[:, 2].min() + 1e-6].mean(axis=0)
-    distance_mm = trimesh.proximity.closest_point(truth, measured)[1]
-    rms_mm = float(np.sqrt(np.mean(distance_mm**2)))
-    assert 0.02 < rms_mm < 0.5, rms_mm
-    assert np.percentile(distance_mm, 95) < 0.8
-    # the foot is closed where it is, not left open and not bulging
-    assert trimesh.proximity.closest_point(mesh, foot[None])[1][0] < 1.5
+    assert 0.1 < distances(mesh, foot[None])[0] < 5.0
+
+
+def distances(mesh: trimesh.Trimesh, points: np.ndarray) -> np.ndarray:
+    """mm (n,) from points (n, 3) to a surface."""
+    core, scene = open3d().core, open3d().t.geometry.RaycastingScene()
+    scene.add_triangles(core.Tensor(mesh.vertices.astype(np.float32)), core.Tensor(mesh.faces.astype(np.uint32)))
+    return scene.compute_distance(core.Tensor(points.astype(np.float32))).numpy()
 
 
 def test_a_plan_is_a_full_turn_or_a_range() -> None:

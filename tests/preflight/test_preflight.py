@@ -9,7 +9,7 @@ import pytest
 from imperfect_rig import Imperfections, imperfect, resampled_rig
 
 from slviewer.devices.protocols import CameraSettings, Rig
-from slviewer.devices.simulated import simulated_rig
+from slviewer.devices.simulated import SimulatedTurntable, simulated_rig
 from slviewer.devices.world import SimulatedWorld
 from slviewer.errors import Cancelled
 from slviewer.pipeline.check_results import Preflight
@@ -55,6 +55,17 @@ def test_a_sound_rig_is_left_in_peace(seed):
     assert found.to_dict()["checks"][0]["name"] == "screen"
     table = np.array(found.levels)
     assert np.abs(table - np.arange(256)).max() <= 2
+
+
+def test_a_turntable_is_checked_too():
+    scene = world()
+    found = looked(replace(simulated_rig(scene), turntable=SimulatedTurntable(scene)))
+    assert found.check("turntable").verdict == found.verdict == "good" and len(found.checks) == 11
+    assert abs(scene.table_deg) < 0.2 and scene.standing == "board"
+    lame = SimulatedTurntable(scene)
+    lame.open()
+    broken = looked(replace(simulated_rig(scene), turntable=lame))
+    assert wrong_with(broken) == {"turntable"} and "close it first" in broken.check("turntable").remedy.lower()
 
 
 def test_gamma_is_measured_and_mended_by_its_table():
