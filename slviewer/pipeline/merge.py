@@ -189,11 +189,17 @@ def merge(
         if out.suffix.lower() != ".ply":
             raise UsageError(f"merged points are written as .ply, not as {out.name}: a mesh goes into other files too")
         out.parent.mkdir(parents=True, exist_ok=True)
-    with opened(session, write=out is None) as store:
-        if start == "placed":
-            poses = _load_places(store, names)
-        table_deg = _list_table_angles(store, names, start, angle)
+    if angle is not None and start != "turntable":
+        raise UsageError("an angle from scan to scan is that of a turntable: give --start turntable too, or neither")
+    table_deg = None if angle is None else {name: angle * k for k, name in enumerate(names)}
+    is_stored = start == "placed" or (start == "turntable" and angle is None)
+    if not is_stored:
         starts = _initial_alignments(names, start, table_deg, axis, poses, picked, warn)
+    with opened(session, write=out is None) as store:
+        if is_stored:
+            poses = _load_places(store, names) if start == "placed" else poses
+            table_deg = _load_table_angles(store, names) if start == "turntable" else None
+            starts = _initial_alignments(names, start, table_deg, axis, poses, picked, warn)
         check_accepted(store, accept_rejected)
         fitted = load_model(store, model or preferred_model(store))
         warn_if_stale(store, warn)
@@ -279,21 +285,8 @@ def merge_record(store: Session, merged: Merge, model: str) -> dict[str, Any]:
     }
 
 
-def _list_table_angles(
-    store: Session, names: Sequence[str], start: StartKind, angle: float | None
-) -> dict[str, float] | None:
-    """Return the turntable's angle of each scan, or None where the initial alignment is another.
-
-    Without the ``angle`` of a step, the stored ones of a single turn. Raises UsageError where these are missing.
-    """
-    if start != "turntable":
-        if angle is not None:
-            raise UsageError(
-                "an angle from scan to scan is that of a turntable: give --start turntable too, or neither"
-            )
-        return None
-    if angle is not None:
-        return {name: angle * k for k, name in enumerate(names)}
+def _load_table_angles(store: Session, names: Sequence[str]) -> dict[str, float]:
+    """Return the turntable's angle, deg, of scans of a single turn. Raises UsageError for others."""
     stored = {name: store.load_capture(name).turn_step for name in names}
     table_deg = {name: step.deg for name, step in stored.items() if step is not None}
     if missing := [name for name in names if name not in table_deg]:

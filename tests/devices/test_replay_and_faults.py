@@ -118,7 +118,7 @@ def test_a_rig_opens_as_a_whole_or_not_at_all():
 
 def test_drivers_are_found_by_name():
     assert {"simulated", "replay"} <= set(drivers())
-    assert all(d.what and (d.camera or d.projector or d.rig) for d in available())
+    assert all(d.what and (d.camera or d.projector or d.turntable or d.rig) for d in available())
     assert driver("simulated").rig(scale=0.1).camera.size == (160, 120)
     with pytest.raises(InputError, match=r"replay.*simulated"):
         driver("nothing")

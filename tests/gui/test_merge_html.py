@@ -52,9 +52,11 @@ def test_names_inside_sentences_and_angles() -> None:
     assert "Not merged.</b> Lion <b> hangs on nothing" in unescape(
         merge_failure_html("scan_01 hangs on nothing", LABELS)
     )
-    turned = unescape(turntable_html(["scan_02", "scan_10", "scan_03"], 22.5, LABELS)).replace("\xa0", " ")
+    turned = unescape(turntable_html(["scan_02", "scan_10", "scan_03"], [0.0, 22.5, 45.0], LABELS)).replace("\xa0", " ")
     assert "scan_02 at 0°, Tail at 22.5°, Lion, behind at 45°. " in turned
-    assert "a at 0°, b at 30°, c at 60°, …, e at 120°. " in unescape(turntable_html(list("abcde"), 30.0, {}))
+    assert "a at 0°, b at 30°, c at 60°, …, e at 120°. " in unescape(
+        turntable_html(list("abcde"), [0.0, 30.0, 60.0, 90.0, 120.0], {})
+    )
 
 
 def test_merged_points_by_scan_and_by_uncertainty(tmp_path: Path) -> None:

@@ -153,7 +153,14 @@ def test_colours_are_kept(tmp_path: Path):
 def test_devices_says_what_there_is(run: Run):
     status, text, _ = run("devices")
     assert status == 0
-    for line in ("simulated (rig)", "browser (projector)", "needs the projector page", "rigs:", "  replay: Recorded"):
+    for line in (
+        "simulated (turntable, rig)",
+        "grbl (turntable)",
+        "browser (projector)",
+        "needs the projector page",
+        "rigs:",
+        "  replay: Recorded",
+    ):
         assert line in text
 
 
