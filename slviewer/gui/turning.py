@@ -24,7 +24,7 @@ class TurnInputs:
                 hint="360 for a full turn; negative turns the other way",
             )  # fmt: skip
             self._then_merge: Any = gui.add_checkbox(
-                "Merge and mesh at the end", True, hint="The mesh is closed, also where the part stands"
+                "Merge and mesh", True, hint="At the end; the mesh is closed, also where the part stands"
             )
             self._scan = context.button(
                 "Scan all round",
