@@ -194,7 +194,8 @@ class GcodeTurntable(Openable):
                 self._write(f"{question}\n".encode())
                 until = min(end, time.monotonic() + _ANSWER_S * self._boot_s / BOOT_S)
                 while (line := self._read_line(until)) is not None:
-                    if answer in line:
+                    refused = dialect == "grbl" and line.startswith("error:")  # it is GRBL, but paused
+                    if answer in line or refused:
                         self._drain()
                         return "grbl" if dialect == "grbl" else "marlin"
                     if line.startswith(("ok", "error:")):

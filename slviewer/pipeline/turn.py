@@ -104,7 +104,7 @@ def turn(
             Negative to turn the other way.
         name: Name of the turn; its captures are NAME_01, NAME_02 and so on. By default turn1, turn2 ...
         resume: Capture what is missing of the turn of that name, by default of the last one.
-        merge: Merge the scans and mesh the merge.
+        merge: Whether to merge the scans and mesh the merge; --no-merge captures only.
         mesh: File of the mesh, .ply, .stl, .obj or .glb; by default a .ply in the session's exports.
         patterns: p18, complementary, gray or multifrequency; by default the session's, else complementary.
         exposure_ms: Exposure of the camera; by default the rig's, else what the camera is set to.

@@ -19,6 +19,7 @@ Fault = Literal[
     "reset",
     "slow",
     "locked",
+    "paused",
     "boots",
     "other baud",
     "stops",
@@ -36,7 +37,7 @@ class Controller:
         self.position = 0.0
         self.received: list[str] = []
         self._begin, self._target, self._begun, self._duration = 0.0, 0.0, 0.0, 0.0
-        self._state = "Alarm" if fault == "locked" else "Idle"
+        self._state = {"locked": "Alarm", "paused": "Hold:0"}.get(fault, "Idle")
         self._waiting = False  # for the end of a motion, as M400 does
         self._relative, self._buffer = False, b""
         self._born = time.monotonic()
@@ -98,7 +99,9 @@ class Controller:
             self._handle_marlin(line)
 
     def _handle_grbl(self, line: str) -> None:
-        if line == "$I":
+        if line == "$I" and self.fault == "paused":
+            self._send(b"error:8\r\n")
+        elif line == "$I":
             self._send(b"[VER:1.1h.20190825:]\r\n[OPT:V,15,128]\r\nok\r\n")
         elif match := re.fullmatch(r"\$J=G91 G21 X(-?[\d.]+) F([\d.]+)", line):
             if self._state == "Alarm":

@@ -137,7 +137,12 @@ def test_noise_and_slowness_are_no_faults(dialect: Any, fault: Fault) -> None:
 
 @pytest.mark.parametrize(
     ("fault", "facts"),
-    [("locked", ("locked by an alarm", "$X")), ("other baud", ("unreadable", "115200")), ("silent", ())],
+    [
+        ("locked", ("locked by an alarm", "$X")),
+        ("paused", ("is paused", "feed hold")),
+        ("other baud", ("unreadable", "115200")),
+        ("silent", ()),
+    ],
 )
 def test_a_controller_that_cannot_turn_is_not_opened(fault: Fault, facts: tuple[str, ...]) -> None:
     with Controller("grbl", fault) as controller:
