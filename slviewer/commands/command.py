@@ -41,6 +41,22 @@ class Option:
 
 LARGEST = 1e12
 """The largest number, of any unit, that a command takes."""
+RANGES: dict[str, tuple[float, float]] = {
+    "at": (0, LARGEST),
+    "budget_s": (0, LARGEST),
+    "degree": (0, 10),
+    "exposure_ms": (1e-6, 1e6),
+    "exposures_ms": (1e-6, 1e6),
+    "fill_holes": (0, 1e5),
+    "folds": (2, 1000),
+    "gain": (0, 1e4),
+    "port": (0, 65535),
+    "poses": (0, 1000),
+    "seed": (0, (1 << 32) - 1),
+    "smooth": (0, 1000),
+    "triangles": (1, 1e9),
+}
+"""Of the numbers that a command takes, by its parameter, where they are narrower."""
 JSON = Option("json", Path | None, None, "Write the result to this file too.")
 
 
@@ -147,11 +163,13 @@ def union(commands: Mapping[str, Callable[..., Any]]) -> Any:
 
 
 def _check_numbers(arguments: Mapping[str, Any]) -> None:
-    """Raise UsageError for numbers that no quantity has: infinite ones, none, and beyond `LARGEST`."""
+    """Raise UsageError for numbers outside of their range in `RANGES`, and for any that is infinite or not a number."""
     for name, value in arguments.items():
+        low, high = RANGES.get(name, (-LARGEST, LARGEST))
         for number in value if isinstance(value, tuple | list) else (value,):
-            if isinstance(number, float | int) and not abs(number) <= LARGEST:
-                raise UsageError(f"--{name.replace('_', '-')} is {number:g}: give a number up to {LARGEST:g}")
+            if isinstance(number, float | int) and not low <= number <= high:
+                stated = f"{number:g}" if abs(number) < LARGEST else str(number)[:20]
+                raise UsageError(f"--{name.replace('_', '-')} is {stated}: give a number from {low:g} to {high:g}")
 
 
 def _make_parameter(name: str, kind: Any, default: Any) -> inspect.Parameter:
