@@ -228,7 +228,8 @@ def run(
     channel = Channel()
     with Operator(set_up=partial(set_up, channel=channel)) as operator:
         _check_granted(operator, operator.open_session(session or Path(DEFAULT_SESSION)))
-        remembered = operator.session is not None and operator.session.decision("rig")
+        store = operator.session
+        remembered = store is not None and (store.valid_decision("rig") or store.decision_faults())
         if rig or not remembered:  # a remembered rig that is not connected now is not replaced by the simulated one
             _check_granted(operator, operator.choose_rig(rig_choice(rig or "simulated", operator.session)))
         app = App(operator, serving or Serving(), channel=channel, print_links=print_links)

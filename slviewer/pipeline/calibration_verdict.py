@@ -94,7 +94,7 @@ def load_last_verdict(store: Session) -> Verdict | None:
     """Load the verdict on the last attempt to calibrate, also a failed one; None before the first."""
     if not store.has_result(VERDICT):
         return None
-    return from_plain(store.load_result(VERDICT, only=())[0]["verdict"], Verdict)
+    return store.decode_result(VERDICT, lambda meta, _: from_plain(meta["verdict"], Verdict), only=())
 
 
 def rejection_error(verdict: Verdict, is_saved: bool) -> CalibrationRejected:

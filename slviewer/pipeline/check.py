@@ -1,5 +1,6 @@
 """Is the saved calibration still good? One capture of its board answers, and the session remembers."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any
@@ -116,9 +117,10 @@ def check(
 
 def _drift_reference(store: Session, stereo: StereoModel, capture: str) -> DriftReference:
     """Load or build the drift reference from the calibration's poses except the capture; stored, as it is slow."""
-    saved = store.load_fresh(REFERENCE) if capture not in stereo.poses else None
-    if saved is not None:
-        return DriftReference.from_arrays(stereo.rig, saved[1])
+    if capture not in stereo.poses:
+        saved = store.decode_fresh(REFERENCE, lambda _, arrays: DriftReference.from_arrays(stereo.rig, arrays))
+        if saved is not None:
+            return saved
     poses = [name for name in stereo.poses if name != capture]
     reference = build_reference(stereo.rig, [DriftView.from_observation(o) for o in load_observations(store, poses)])
     if capture not in stereo.poses:
@@ -129,11 +131,13 @@ def _drift_reference(store: Session, stereo: StereoModel, capture: str) -> Drift
 
 def load_drift_history(store: Session) -> tuple[DriftRecord, ...]:
     """Load every drift check of the session, the oldest first."""
-    records = []
-    for name in numbered_results(store, "drift"):
-        values = store.load_result(name, only=())[0]["checked"]
-        records.append(DriftRecord(values["time"], values["calibration"], from_plain(values, Drift)))
-    return tuple(records)
+
+    def decode(meta: Mapping[str, Any], _: object) -> DriftRecord:
+        """Return the record of one check."""
+        values = meta["checked"]
+        return DriftRecord(values["time"], values["calibration"], from_plain(values, Drift))
+
+    return tuple(store.decode_result(name, decode, only=()) for name in numbered_results(store, "drift"))
 
 
 def _calibration_smoothing(store: Session) -> Smoothing:

@@ -91,5 +91,6 @@ def load_or_save_check(session: Session, capture: Capture, frames: np.ndarray | 
 
 def load_check(session: Session, name: str) -> FrameCheck | None:
     """The saved check of a capture; None where it is missing, of other frames or of another version."""
-    saved = session.load_fresh(f"trust/{name}")
-    return FrameCheck.from_json(saved[0]) if saved and saved[0].get("version") == VERSION else None
+    return session.decode_fresh(
+        f"trust/{name}", lambda meta, _: FrameCheck.from_json(meta) if meta.get("version") == VERSION else None
+    )

@@ -29,7 +29,7 @@ def inspect(session: SessionLike, *, check: bool = False, progress: Progress = i
         if check:
             return _check(store, progress)
         captures, faults = store.read_captures()
-        damage = list(faults.values())
+        damage = [*faults.values(), *store.decision_faults()]
         lines = [f"{store.folder}: {len(captures)} capture{'s' * (len(captures) != 1)}"]
         lines += [f"  {name} was complete, and not yet in its place: it is now" for name in store.recovered]
         parts: list[Callable[[], Iterable[str]]] = [
@@ -52,9 +52,8 @@ def inspect(session: SessionLike, *, check: bool = False, progress: Progress = i
 def _check(store: Session, progress: Progress) -> str:
     """Read everything, and describe what was compared. Raises DamagedError that lists what is damaged, if anything."""
     (captures, faults), results = store.read_captures(), store.result_names()
-    damage = list(faults.values())
-    checks: list[tuple[str, Callable[[], object]]] = [("the decisions", store.excluded)]
-    checks += [(capture.name, capture.verify) for capture in captures]
+    damage = [*faults.values(), *store.decision_faults()]
+    checks: list[tuple[str, Callable[[], object]]] = [(capture.name, capture.verify) for capture in captures]
     checks += [(name, partial(verify_result, store.folder / "results" / name)) for name in results]
     for i, (name, verify) in enumerate(checks):
         progress(i / len(checks), f"checking {name}")
@@ -71,7 +70,7 @@ def _check(store: Session, progress: Progress) -> str:
 
 def _describe_captures(store: Session, captures: Iterable[Capture]) -> list[str]:
     """A line for each capture."""
-    excluded = store.excluded()
+    excluded = store.valid_decision("excluded") or {}
     notes = {name: f"  [excluded: {why}]" for name, why in excluded.items()}
     return [f"  {summarise_capture(capture)}{notes.get(capture.name, '')}" for capture in captures]
 

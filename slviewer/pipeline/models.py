@@ -18,6 +18,7 @@ from slviewer.geometry.rig import StereoRig
 from slviewer.pipeline.feedback import Warn
 from slviewer.pipeline.open_session import SessionLike, opened
 from slviewer.records import from_plain
+from slviewer.session.reading import decoding
 from slviewer.session.store import Session
 
 Model = StereoModel | PixelwiseModel | SplinedModel
@@ -98,12 +99,16 @@ def load_stereo(store: Session) -> StereoModel:
     """Load the session's stereo calibration, without its residual arrows."""
     if "stereo" not in available_models(store):
         raise InputError(f"{store.folder} holds no calibration: run `slviewer calibrate` first")
-    meta = store.load_result("calibration/stereo", only=())[0]
+    return store.decode_result("calibration/stereo", lambda meta, _: _decode_stereo(store, meta), only=())
+
+
+def _decode_stereo(store: Session, meta: Mapping[str, Any]) -> StereoModel:
+    """Return the stereo calibration that ``meta`` describes, with the captures' sizes where it states none."""
     if "model" in meta:
         return StereoModel.from_dict(meta["model"])
     captures = store.captures()
     if not captures and not (meta["camera"] and meta["projector"]):
-        raise InputError(f"{store.folder} holds no capture that states the camera's size: import the scans first")
+        raise SessionError(f"{store.folder} holds no capture that states the camera's size: import the scans first")
     camera = tuple(meta["camera"] or captures[0].size)
     projector = tuple(meta["projector"] or captures[0].sequence.projector)
     m = {name: np.array(value) for name, value in meta["imported"].items()}
@@ -156,13 +161,14 @@ def load_model(store: Session, name: str) -> Model:
         if content in _LOADED:
             return _LOADED[content]
     meta, arrays = store.load_result(result)
-    try:
-        model = _RESTORED[name](meta["model"], arrays)
-    except (KeyError, TypeError) as error:
-        raise SessionError(
-            f"the {name} calibration in {store.folder} was saved by another version of slviewer: "
+    with decoding(
+        result,
+        lambda fault: SessionError(
+            f"the {name} calibration in {store.folder} was saved by another version of slviewer, or {fault}: "
             "run `slviewer calibrate` again"
-        ) from error
+        ),
+    ):
+        model = _RESTORED[name](meta["model"], arrays)
     if isinstance(model, SplinedModel):
         _restore_or_compile(store, model, content)
     with _LOADED_LOCK:
@@ -220,16 +226,18 @@ def recommended_model(store: Session) -> str:
 def load_validation(store: Session) -> CrossValidation | None:
     """How the session's calibrations compare on poses that they were not made from; None where they were not compared
     them as they are now."""
-    saved = store.load_fresh(VALIDATION, only=())
-    return None if saved is None else from_plain(saved[0]["validation"], CrossValidation)
+    return store.decode_fresh(VALIDATION, lambda meta, _: from_plain(meta["validation"], CrossValidation), only=())
 
 
 def rejection_reason(store: Session) -> str:
     """Return why the session's calibration was rejected; empty where it was not, or was never judged."""
     if "stereo" not in available_models(store):
         return ""
-    judged = store.load_result("calibration/stereo", only=())[0].get("verdict")
-    verdict = from_plain(judged, Verdict) if judged else Verdict()
+    verdict = store.decode_result(
+        "calibration/stereo",
+        lambda meta, _: from_plain(meta["verdict"], Verdict) if meta.get("verdict") else Verdict(),
+        only=(),
+    )
     return verdict.reason if verdict.level == "rejected" else ""
 
 

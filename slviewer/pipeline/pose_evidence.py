@@ -1,6 +1,7 @@
 """Evidence of one target pose, computed once and stored in the session as `evidence/<name>`."""
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
@@ -66,7 +67,10 @@ def save_evidence(store: Session, capture: Capture, board: Board, evidence: Pose
 
 def load_evidence(store: Session, name: str, board: Board) -> PoseEvidence | None:
     """Load the stored evidence of a pose; None where it is missing, or of other frames or another board."""
-    saved = store.load_fresh(f"evidence/{name}", only=())
-    if saved is None or (saved[0]["target"], saved[0].get("look")) != (str(board), EVIDENCE_VERSION):
-        return None
-    return PoseEvidence.from_json(saved[0]["evidence"])
+
+    def decode(meta: Mapping[str, Any], _: object) -> PoseEvidence | None:
+        """Return the evidence, unless it is of another board or version."""
+        current = (meta["target"], meta.get("look")) == (str(board), EVIDENCE_VERSION)
+        return PoseEvidence.from_json(meta["evidence"]) if current else None
+
+    return store.decode_fresh(f"evidence/{name}", decode, only=())

@@ -1,8 +1,9 @@
 """The observation of each target pose, computed once and stored in the session with its frames."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -104,19 +105,17 @@ def read_stored_pose(
 
 def load_judged(store: Session, name: str, board: Board, smoothing: Smoothing) -> Judged | None:
     """Load the stored reading of a pose; None where it is of other frames, another board or another smoothing."""
-    saved = store.load_fresh(f"poses/{name}")
-    if saved is None:
-        return None
-    meta, arrays = saved
-    if (meta["target"], meta["smoothing"], meta.get("reading")) != (
-        str(board),
-        _list_settings(smoothing),
-        READING_VERSION,
-    ):
-        return None
-    if meta["refused"]:
-        return Judged(name, None, meta["refused"])
-    return Judged(name, Observation.from_arrays(name, arrays))
+
+    def decode(meta: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> Judged | None:
+        """Return the reading, unless it is of another board, smoothing or version."""
+        settings = (meta["target"], meta["smoothing"], meta.get("reading"))
+        if settings != (str(board), _list_settings(smoothing), READING_VERSION):
+            return None
+        if meta["refused"]:
+            return Judged(name, None, meta["refused"])
+        return Judged(name, Observation.from_arrays(name, arrays))
+
+    return store.decode_fresh(f"poses/{name}", decode)
 
 
 def read_stored_poses(

@@ -152,7 +152,7 @@ def _list_drifts(store: Session) -> list[DriftRow]:
 
 def _list_verifications(store: Session) -> tuple[list[VerificationView], list[SpacingRow]]:
     """The planes and spheres that were measured with the present calibrations, the first MOST_MAPS with error maps."""
-    labels = store.decision("names") or {}
+    labels = store.valid_decision("names") or {}
     views: list[VerificationView] = []
     for result in numbered_results(store, "verify"):
         name = result.removeprefix("verify/")

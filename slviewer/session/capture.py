@@ -86,6 +86,13 @@ class Capture:
         where all are read), SessionError where the capture was replaced since it was loaded.
         """
         path = self.folder / "frames.zarr"
+        n, (width, height) = len(self.sequence.frames) * max(1, len(self.exposures_ms)), self.size
+        if (shape := describe_stack(path)[0]) != (n, height, width):
+            raise DamagedError(
+                f"{self.name}: {self.folder} is damaged: its description states {n} frames of {width}x{height} px, and "
+                f"frames.zarr holds {shape[0]} of {shape[2]}x{shape[1]} px: restore the folder from a copy, or import "
+                "or record the capture again"
+            )
         if (indices is None or self.exposures_ms) and (identity := identify_stack(path)) is not None:
             _verify_once(self.folder, self.hash, identity)
         stack = self._merged(path, indices) if self.exposures_ms else read_stack(path, indices)

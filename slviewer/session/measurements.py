@@ -73,7 +73,7 @@ def load_measurement(store: Session, identity: str) -> Measurement:
     """One measurement. Raises InputError where there is none of that id."""
     result = _result_name(store, identity)
     meta = store.load_result(result, only=())[0]
-    return measurement_from_meta(identity, meta, store.decision(NAMES) or {}, store.state_of(result) == "stale")
+    return measurement_from_meta(identity, meta, store.valid_decision(NAMES) or {}, store.state_of(result) == "stale")
 
 
 def measurement_from_meta(identity: str, meta: Mapping[str, Any], names: Mapping[str, str], stale: bool) -> Measurement:

@@ -51,9 +51,8 @@ def read_file(path: Path, max_bytes: int) -> bytes:
         return file.read(size)  # of a growing file, what it had
 
 
-def read_json(path: Path) -> dict[str, Any]:
-    """The object in a JSON file; DamagedError where the file is damaged or holds no object."""
-    remedy = "restore it from a copy, or move its folder away"
+def read_json(path: Path, remedy: str = "restore it from a copy, or move its folder away") -> dict[str, Any]:
+    """The object in a JSON file; DamagedError, with the remedy, where the file is damaged or holds no object."""
     try:
         data = _check_values(json.loads(read_file(path, MAX_JSON_BYTES)))
     except (ValueError, OSError, RecursionError, MemoryError) as error:

@@ -7,14 +7,13 @@ have their shapes checked by the classes that are made of them.
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, Required, TypedDict
+from typing import Annotated, Any, Required, TypedDict
 
 import msgspec
 
 from slviewer.errors import DamagedError
 from slviewer.fringe.sequence import Axis
 from slviewer.records import from_plain
-from slviewer.session.reading import decoding, read_json
 
 Extent = Annotated[int, msgspec.Meta(ge=1, le=1 << 16)]
 Size = tuple[Extent, Extent]
@@ -273,27 +272,6 @@ class _Scale(ResultMeta, total=False):
     certificate: str
 
 
-_Decisions = TypedDict(
-    "_Decisions",
-    {
-        "excluded": dict[str, str] | None,
-        "names": dict[str, str] | None,
-        "measurement names": dict[str, str] | None,
-        "model": str | None,
-        "target": str | None,
-        "patterns": str | None,
-        "levels": list[Annotated[int, msgspec.Meta(ge=0, le=255)]] | None,
-        "exposures": list[_Exposure] | None,
-        "exposure": dict[Literal["exposure_ms", "gain"], float | None] | None,
-        "sigma_wanted_mm": Annotated[float, msgspec.Meta(ge=0, lt=1e6)] | None,
-        "rig": dict[str, Any] | None,
-        "use_anyway": str | None,
-        "align_scans": bool | None,
-    },
-    total=False,
-)
-
-
 _TYPES: dict[str, Any] = {
     "calibration/stereo": _Stereo,
     "calibration/pixelwise": _Fitted,
@@ -318,14 +296,3 @@ _TYPES: dict[str, Any] = {
 def check_meta(name: str, meta: Mapping[str, Any]) -> None:
     """Raise InputError, which names the entry, unless ``meta`` is what a result of this name holds."""
     from_plain(meta, _TYPES.get(name) or _TYPES.get(name.partition("/")[0]) or ResultMeta)
-
-
-def read_decisions(path: Path) -> dict[str, Any]:
-    """Return the decisions in a file, each of its type; none where it is missing, DamagedError where it is damaged."""
-    if not path.exists():
-        return {}
-    decisions = read_json(path)
-    remedy = "correct it, or restore it from a copy; without it target, rig, names and exclusions are forgotten"
-    with decoding(path, remedy=remedy):
-        from_plain(decisions, _Decisions)
-    return decisions

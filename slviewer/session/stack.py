@@ -14,13 +14,16 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from io import RawIOBase
 from pathlib import Path
+from typing import Annotated, Literal
 
 import google_crc32c
+import msgspec
 import numpy as np
 
 from slviewer.errors import DamagedError, InputError, SessionError
+from slviewer.records import from_plain
 from slviewer.session.atomic import write_bytes
-from slviewer.session.reading import read_json
+from slviewer.session.reading import decoding, read_json
 
 _THREADS = 4  # moving and hashing frames releases the interpreter; more threads only queue for the disk
 _SEPARATOR = "."
@@ -59,6 +62,8 @@ def read_stack(path: Path, indices: Sequence[int] | None = None) -> np.ndarray:
     wanted = list(range(n)) if indices is None else [int(index) for index in indices]
     if any(not 0 <= index < n for index in wanted):
         raise InputError(f"frames {wanted} were requested, {path.parent.name} has frames 0 to {n - 1}")
+    for index in wanted:  # before memory is allocated for what the description announces
+        stack.check_size(index)
     frames = np.empty((len(wanted), *stack.shape[1:]), stack.dtype)
     with ThreadPoolExecutor(_THREADS) as pool:
         list(pool.map(stack.read, wanted, frames))
@@ -71,6 +76,7 @@ def hash_stack(path: Path) -> str:
 
     def digest(index: int) -> bytes:
         """Read one frame and return its digest."""
+        stack.check_size(index)
         frame = np.empty(stack.shape[1:], stack.dtype)
         stack.read(index, frame)
         return _digest(frame)
@@ -101,6 +107,47 @@ def describe_stack(path: Path) -> tuple[tuple[int, int, int], np.dtype]:
     return stack.shape, stack.dtype
 
 
+_Extent = Annotated[int, msgspec.Meta(ge=1, le=1 << 16)]
+
+
+class _ChunkGrid(msgspec.Struct):
+    """The entry `chunk_grid` of `zarr.json`."""
+
+    class Configuration(msgspec.Struct):
+        """Its size of a chunk, frames x rows x columns."""
+
+        chunk_shape: tuple[int, int, int]
+
+    configuration: Configuration
+
+
+class _ChunkKeys(msgspec.Struct):
+    """The entry `chunk_key_encoding` of `zarr.json`."""
+
+    class Configuration(msgspec.Struct):
+        """What stands between the parts of a chunk's name."""
+
+        separator: Literal[".", "/"]
+
+    configuration: Configuration
+
+
+class _Codec(msgspec.Struct):
+    """One of the entry `codecs` of `zarr.json`."""
+
+    name: str
+
+
+class _Description(msgspec.Struct):
+    """The entries of `zarr.json` that are read, with their types and ranges."""
+
+    shape: tuple[_Extent, _Extent, _Extent]
+    data_type: Literal["uint8", "uint16"]
+    chunk_grid: _ChunkGrid
+    chunk_key_encoding: _ChunkKeys
+    codecs: list[_Codec]
+
+
 @dataclass(frozen=True)
 class _StoredStack:
     """The description of a stack on disk, and access to its chunks."""
@@ -114,35 +161,34 @@ class _StoredStack:
     @classmethod
     def open(cls, path: Path) -> "_StoredStack":
         """Read the description of a stack; SessionError for another layout."""
-        description = read_json(path / "zarr.json")
-        try:
-            n, height, width = (int(extent) for extent in description["shape"])
-            dtype = np.dtype(description["data_type"])
-            chunk = description["chunk_grid"]["configuration"]["chunk_shape"]
-            separator = description["chunk_key_encoding"]["configuration"]["separator"]
-            codecs = [codec["name"] for codec in description["codecs"]]
-        except (KeyError, TypeError, ValueError) as error:
-            raise SessionError(
-                f"{path} does not describe a stack of frames ({error}): import the capture again"
-            ) from error
+        with decoding(path / "zarr.json"):
+            described = from_plain(read_json(path / "zarr.json"), _Description)
+        n, height, width = described.shape
+        codecs = [codec.name for codec in described.codecs]
         known = codecs in (["bytes"], ["bytes", "crc32c"])
-        if dtype not in _DTYPES or chunk != [1, height, width] or separator not in (".", "/") or not known:
+        if described.chunk_grid.configuration.chunk_shape != (1, height, width) or not known:
             raise SessionError(f"{path} was not laid out by slviewer (one uncompressed chunk a frame): import it again")
-        return cls(path, (n, height, width), dtype, separator, "crc32c" in codecs)
+        separator = described.chunk_key_encoding.configuration.separator
+        return cls(path, (n, height, width), np.dtype(described.data_type), separator, "crc32c" in codecs)
 
     def read(self, index: int, frame: np.ndarray) -> None:
         """Read one frame, little-endian, into `frame` (h, w). Raises DamagedError where it is not what was saved."""
         chunk, checksum = self._chunk_path(index), bytearray(_CHECKSUM_BYTES * self.has_checksums)
         try:
-            with open(chunk, "rb", buffering=0) as file:
-                whole = os.fstat(file.fileno()).st_size == frame.nbytes + len(checksum)
-                whole = whole and _read_into(file, frame.data.cast("B")) and _read_into(file, memoryview(checksum))
+            with open(chunk, "rb", buffering=0) as file:  # regular, as its size was right
+                whole = _read_into(file, frame.data.cast("B")) and _read_into(file, memoryview(checksum))
         except OSError as error:
             raise self._error(index, error) from error
         if not whole:
             raise self._damage(index, "is cut short")
         if checksum and checksum != _checksum(frame):
             raise self._damage(index, "differs from its checksum")
+
+    def check_size(self, index: int) -> None:
+        """Raise DamagedError unless a frame's file has the size that the description announces."""
+        frame_bytes = self.shape[1] * self.shape[2] * self.dtype.itemsize
+        if self.identify(index)[1] != frame_bytes + _CHECKSUM_BYTES * self.has_checksums:
+            raise self._damage(index, "is cut short, or longer than it was")
 
     def identify(self, index: int) -> tuple[int, ...]:
         """Return number, size and time of a frame's file. Raises DamagedError where it is missing."""

@@ -1,11 +1,10 @@
 """A session: the folder that holds captures, results and decisions, and the only access to it."""
 
 import contextlib
-import threading
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal, TypeVar, get_args
 
 import numpy as np
 
@@ -22,20 +21,21 @@ from slviewer.session.capture import (
     read_captures,
     write_capture,
 )
+from slviewer.session.decisions import Decisions
 from slviewer.session.layout import create_layout, inner_folders, is_session, new_folder, remove_layout, session_folder
 from slviewer.session.lock import WriterLock
 from slviewer.session.names import is_safe_name, natural_key, safe_name, safe_path
-from slviewer.session.reading import expand_user
-from slviewer.session.result_types import read_decisions
+from slviewer.session.reading import decoding, expand_user
 from slviewer.session.results import check_place, check_result, list_results, read_arrays, read_meta, write_result
 from slviewer.session.trash import Trashed, list_trash, trash_place
 
 _MAX_INPUTS_CHAIN = 32
 
+T = TypeVar("T")
 State = Literal["absent", "fresh", "stale"]
 
 
-class Session:
+class Session(Decisions):
     """An open session folder. Use `Session.create`, `Session.open` or `Session.open_or_create`, in a `with` block.
 
     Readers need no lock and may be many; one writer at a time holds the folder. Saving from several threads of the
@@ -43,9 +43,8 @@ class Session:
     """
 
     def __init__(self, folder: Path, lock: WriterLock | None):
-        self.folder = folder
+        super().__init__(folder)
         self._lock = lock
-        self._decisions_lock = threading.Lock()
         self._allow: Callable[[], None] | None = None
         self._created: Literal["", "session", "folder"] = ""  # what this object made
         self._together: atomic.Together | None = None
@@ -327,6 +326,20 @@ class Session:
             raise InputError(f"there is no result {name!r} in {self.folder}: the results are {there}")
         return read_meta(folder), read_arrays(folder, only)
 
+    def decode_result(
+        self,
+        name: str,
+        decode: Callable[[dict[str, Any], dict[str, np.ndarray]], T],
+        only: Collection[str] | None = None,
+    ) -> T:
+        """Return what ``decode(meta, arrays)`` makes of a result.
+
+        Raises as `load_result`, and DamagedError where ``decode`` meets a value that it does not expect.
+        """
+        meta, arrays = self.load_result(name, only)
+        with decoding(self._result_folder(name)):
+            return decode(meta, arrays)
+
     def trash_result(self, name: str) -> Path:
         """Move a result to the trash folder; returns its place there."""
         self._require_writer()
@@ -378,9 +391,18 @@ class Session:
         self, name: str, only: Collection[str] | None = None
     ) -> tuple[dict[str, Any], dict[str, np.ndarray]] | None:
         """What `load_result` returns for a result that is fresh and whole; None for any other, to be computed again."""
+        return self.decode_fresh(name, lambda meta, arrays: (meta, arrays), only)
+
+    def decode_fresh(
+        self,
+        name: str,
+        decode: Callable[[dict[str, Any], dict[str, np.ndarray]], T],
+        only: Collection[str] | None = None,
+    ) -> T | None:
+        """What `decode_result` returns for a result that is fresh and whole; None for any other, as `load_fresh`."""
         with contextlib.suppress(DamagedError):
             if self.state_of(name) == "fresh":
-                return self.load_result(name, only)
+                return self.decode_result(name, decode, only)
         return None
 
     # decisions and exports
@@ -388,23 +410,7 @@ class Session:
     def exclude(self, name: str, why: str) -> None:
         """Exclude a capture from calibrations from now on, with the reason."""
         self.load_capture(name)
-        self._decide("excluded", lambda excluded: {**(excluded or {}), name: why})
-
-    def include(self, name: str) -> None:
-        """Include a capture again. Does nothing where it was not excluded."""
-        self._decide("excluded", lambda all: {other: why for other, why in (all or {}).items() if other != name})
-
-    def excluded(self) -> dict[str, str]:
-        """{capture: reason} of the captures that the operator excluded."""
-        return dict(self.decision("excluded") or {})
-
-    def decide(self, what: str, value: Any) -> None:
-        """Remember a decision, such as the rig or the target, as a plain value that JSON can hold."""
-        self._decide(what, lambda _: value)
-
-    def decision(self, what: str) -> Any:
-        """What was decided last; None where nothing was."""
-        return read_decisions(self.folder / "decisions.json").get(what)
+        self._decide("excluded", lambda: {**self.excluded(), name: why})
 
     def save_rig(self, name: str, text: str) -> Path:
         """Keep the operator's own rig, TOML, in place of one of that name; returns its file."""
@@ -490,11 +496,3 @@ class Session:
         if (folder / "meta.json").is_file():
             content_hashes.append(str(read_meta(folder).get("hash")))
         return content_hashes
-
-    def _decide(self, what: str, change: Callable[[Any], Any]) -> None:
-        """Replace a decision by ``change`` of its present value (None without one)."""
-        self._require_writer()
-        path = self.folder / "decisions.json"
-        with self._decisions_lock:
-            decisions = read_decisions(path)
-            atomic.replace_json(path, {**decisions, what: change(decisions.get(what))})

@@ -3,6 +3,7 @@
 Requests (`operator` and the `*_requests`) call in here; panels do not. Each attribute is written by the engine alone.
 """
 
+import contextlib
 import shutil
 import threading
 import time
@@ -10,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -147,7 +149,7 @@ class Engine:
 
     def _restore_rig(self, store: Session, rig: Choice | None) -> None:
         """Use `rig`, else the rig saved in the session, else save the current one there; report one that fails."""
-        choice = rig or store.decision("rig")
+        choice = rig or store.valid_decision("rig")
         if choice and choice != self._choice:
             try:
                 self.use_rig(choice)
@@ -159,8 +161,8 @@ class Engine:
                 self.acquisition.use(None)
                 self.notices.add_failure("Choosing the rig", error)
         elif self._choice is not None:
-            store.decide("rig", dict(self._choice))
-            if exposure := store.decision("exposure"):
+            self._remember(store, "rig", dict(self._choice))
+            if exposure := store.valid_decision("exposure"):
                 self.acquisition.set_camera(CameraSettings(**exposure))
 
     def use_rig(self, choice: Choice) -> None:
@@ -171,21 +173,27 @@ class Engine:
         """
         with self.lock:
             store = self.session
-            known = dict((store.decision("rig") if store is not None else None) or {})
+            known = dict((store.valid_decision("rig") if store is not None else None) or {})
             same = {**known, "settle_ms": None} == {**choice, "settle_ms": None}
             if same and "settle_ms" in known and "settle_ms" not in choice:
                 choice = {**choice, "settle_ms": known["settle_ms"]}
             bench = self._set_up(choice, self._parse_board())
             if store is not None and known != dict(choice):
-                store.decide("rig", dict(choice))
+                self._remember(store, "rig", dict(choice))
             if store is not None and not same:
                 for decision in ("exposure", "exposures", "levels"):  # those of another camera do not apply
-                    store.decide(decision, None)
-            exposure = store.decision("exposure") if store is not None else None
+                    self._remember(store, decision, None)
+            exposure = store.valid_decision("exposure") if store is not None else None
             exposure = exposure or {key: choice[key] for key in ("exposure_ms", "gain") if choice.get(key)}
             self._forget_rig(choice, bench)
             self._rig_fault = ""
             self.acquisition.use(bench.rig, CameraSettings(**exposure) if exposure else None)
+
+    @staticmethod
+    def _remember(store: Session, what: str, value: Any) -> None:
+        """Remember a decision of the rig's in the session, unless its decisions are damaged, which its faults name."""
+        with contextlib.suppress(DamagedError):
+            store.decide(what, value)
 
     def _forget_rig(self, choice: Choice, bench: RigSetup | None) -> None:
         """Forget what was measured with the rig before, and remember the new one."""

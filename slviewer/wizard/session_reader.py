@@ -114,7 +114,7 @@ class SessionReader:
 
     def target(self) -> str:
         """Return the board's notation: as chosen, else that of the calibration or of the poses; empty where unknown."""
-        decided = self.session.decision("target")
+        decided = self.session.valid_decision("target")
         if decided:
             return str(decided)
         stereo = None
@@ -126,7 +126,7 @@ class SessionReader:
 
     def patterns(self) -> str:
         """Return the name of the pattern sequence."""
-        return str(self.session.decision("patterns") or DEFAULT_PATTERNS)
+        return str(self.session.valid_decision("patterns") or DEFAULT_PATTERNS)
 
     def has_thumbnail(self, capture: Capture) -> bool:
         """Whether a thumbnail of the capture is stored."""
@@ -148,11 +148,11 @@ class SessionReader:
 
     def levels(self) -> tuple[int, ...] | None:
         """Return the table of grey levels that linearises the projector; None where it is not used."""
-        return tuple(int(level) for level in self.session.decision("levels") or ()) or None
+        return tuple(int(level) for level in self.session.valid_decision("levels") or ()) or None
 
     def exposures_ms(self) -> tuple[float, ...]:
         """Return the exposures of every capture, ms; empty: a single one, the camera's."""
-        return tuple(float(exposure) for exposure in self.session.decision("exposures") or ())
+        return tuple(float(exposure) for exposure in self.session.valid_decision("exposures") or ())
 
     def read(self, rig: RigView, focal_px: float | None) -> SessionView:
         """Read the session's current state; what is damaged is missing from it, and named in its `faults`.
@@ -161,7 +161,7 @@ class SessionReader:
         """
         session, target = self.session, self.target()
         sound, faults = session.read_captures()
-        self._faults = list(faults.values())
+        self._faults = [*faults.values(), *session.decision_faults()]
         captures = {capture.name: capture for capture in sound}
         calibration = self._attempt("the calibration", lambda: self._read_calibration(captures), None)
         models = calibration.models if calibration else ()
@@ -171,7 +171,7 @@ class SessionReader:
             if not _has_changed(meta["inputs"], hashes):
                 hashes[name] = meta["hash"]
         factors = {model: scale_factor(session, model) for model in models}
-        inputs = _Inputs(captures, session.decision("names") or {}, hashes, factors)
+        inputs = _Inputs(captures, session.valid_decision("names") or {}, hashes, factors)
         poses, plan, pending = self._read_poses(captures, target, calibration, rig, focal_px)
         verifications = self._read_verifications(inputs)
         verdict = self._attempt("the verdict", lambda: load_last_verdict(session), None)
@@ -184,7 +184,7 @@ class SessionReader:
             poses=poses,
             plan=plan,
             pending_plan=pending,
-            wanted_mm=float(session.decision("sigma_wanted_mm") or 0.0) or (plan.usual_mm if plan else 0.0),
+            wanted_mm=float(session.valid_decision("sigma_wanted_mm") or 0.0) or (plan.usual_mm if plan else 0.0),
             calibration=calibration,
             verdict=verdict,
             verdict_of_calibration=of_calibration,
@@ -282,7 +282,7 @@ class SessionReader:
         self, pose: Capture, target: str, meta: Mapping[str, Any] | None, calibration: CalibrationView | None
     ) -> tuple[PoseState, str]:
         """Return the state of a target pose and the reason, which is empty where there is none."""
-        excluded = self.session.excluded()
+        excluded = self.session.valid_decision("excluded") or {}
         if pose.name in excluded:
             return "excluded", excluded[pose.name]
         if (pose.name, pose.hash, target) in self._unreadable:
@@ -344,7 +344,7 @@ class SessionReader:
             stale=foreign or self._describe_changes(self._load_meta("calibration/stereo")["inputs"], captures),
             fit_rms_mm=fit_rms or {},
             recommended=recommended_model(session),
-            chosen=str(decided) if (decided := session.decision("model")) in models else "",
+            chosen=str(decided) if (decided := session.valid_decision("model")) in models else "",
             rejected=rejection_reason(session),
             is_pinned=accepts_rejected(session),
             splined=splined,
@@ -355,7 +355,7 @@ class SessionReader:
 
     def _describe_changes(self, inputs: Mapping[str, str], captures: Mapping[str, Capture]) -> str:
         """Describe which poses of a calibration were retaken, deleted or excluded since; empty where none was."""
-        excluded = self.session.excluded()
+        excluded = self.session.valid_decision("excluded") or {}
         gone = [n for n, used in inputs.items() if n not in captures or captures[n].hash != used]
         dropped = [n for n in inputs if n in excluded]
         for names, change in ((gone, "retaken or deleted"), (dropped, "excluded")):
@@ -424,7 +424,7 @@ class SessionReader:
 
     def _read_measurements(self, inputs: _Inputs) -> tuple[Measurement, ...]:
         """Read all measurements, in the order they were made; stale as ``pipeline.measurements`` defines it."""
-        known, read, names = dict(inputs.hashes), [], self.session.decision(NAMES) or {}
+        known, read, names = dict(inputs.hashes), [], self.session.valid_decision(NAMES) or {}
         results = self.session.result_names()
         for kind in ("scale/", "merge/", f"{MEASUREMENTS}/"):  # each is made from captures and from those before it
             for result in (name for name in results if name.startswith(kind)):

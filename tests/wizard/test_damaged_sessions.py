@@ -107,11 +107,12 @@ def test_the_page_shows_the_present_state_while_a_file_is_damaged(operator: Oper
     (folder / "decisions.json").write_text("{")
     assert not operator.choose_target("circles:7x5:20")
     operator.set_autopilot_status("going on")
-    failed = operator.wait_for(lambda snapshot: bool(snapshot.read_failure and snapshot.autopilot), 30)
-    assert failed is not None and "decisions.json" in failed.read_failure
-    assert failed.session is not None and len(failed.session.scans) == 2
+    failed = operator.wait_for(lambda snapshot: bool(snapshot.session and snapshot.session.faults), 30)
+    assert failed is not None and failed.session is not None
+    assert "decisions.json" in failed.session.faults[0] and len(failed.session.scans) == 2
     (folder / "decisions.json").write_text(json.dumps({"names": {"scan_01": "a vase"}}))
-    recovered = operator.wait_for(lambda snapshot: not snapshot.read_failure, 30)  # without any request
+    assert operator.choose_target("circles:7x5:20")
+    recovered = operator.wait_for(lambda snapshot: bool(snapshot.session and not snapshot.session.faults), 30)
     assert recovered is not None and recovered.session is not None
     assert [scan.label for scan in recovered.session.scans] == ["a vase", "scan_02"]
 
@@ -128,9 +129,19 @@ def test_a_damaged_pose_is_refused_by_name(folder: Path) -> None:
 
 
 def test_the_reason_why_the_wizard_cannot_start_is_stated(folder: Path) -> None:
-    (folder / "decisions.json").write_text("{")
-    with pytest.raises(SlviewerError, match=r"decisions\.json cannot be read"):
+    (folder / "session.json").write_text("{")
+    with pytest.raises(SlviewerError, match=r"session\.json"):
         run(folder, open_browser=False)
+
+
+def test_a_session_opens_whose_decisions_are_damaged(folder: Path) -> None:
+    (folder / "decisions.json").write_text("{")
+    with Operator(folder) as operator:
+        shown = operator.wait_until_idle(30).session
+        assert shown is not None and len(shown.scans) == 2
+        assert any("decisions.json" in fault and "move this file away" in fault for fault in shown.faults)
+        assert not operator.choose_target("circles:7x5:20")  # which would forget the others
+    assert (folder / "decisions.json").read_text() == "{"
 
 
 def test_captures_that_were_completed_on_opening_are_reported(folder: Path) -> None:

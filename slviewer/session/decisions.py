@@ -1,0 +1,107 @@
+"""What the operator decided: `decisions.json`, an entry each, with its type.
+
+An entry that is damaged concerns only those that need it; the others are read, and stay when one is written.
+"""
+
+import contextlib
+import os
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypedDict
+
+import msgspec
+
+from slviewer.errors import DamagedError, InputError
+from slviewer.records import from_plain
+from slviewer.session.atomic import replace_json
+from slviewer.session.reading import read_json
+
+_Exposure = Annotated[float, msgspec.Meta(gt=0, lt=1e9)]
+_Decisions = TypedDict(
+    "_Decisions",
+    {
+        "excluded": dict[str, str] | None,
+        "names": dict[str, str] | None,
+        "measurement names": dict[str, str] | None,
+        "model": str | None,
+        "target": str | None,
+        "patterns": str | None,
+        "levels": list[Annotated[int, msgspec.Meta(ge=0, le=255)]] | None,
+        "exposures": list[_Exposure] | None,
+        "exposure": dict[Literal["exposure_ms", "gain"], float | None] | None,
+        "sigma_wanted_mm": Annotated[float, msgspec.Meta(ge=0, lt=1e6)] | None,
+        "rig": dict[str, Any] | None,
+        "use_anyway": str | None,
+        "align_scans": bool | None,
+    },
+    total=False,
+)
+_REMEDY = "restore it from a copy, or move this file away, which forgets exclusions, names and settings"
+
+
+class Decisions:
+    """The decisions in the folder of a session."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._decisions_lock = threading.Lock()
+
+    def include(self, name: str) -> None:
+        """Include a capture again. Does nothing where it was not excluded."""
+        self._decide("excluded", lambda: {other: why for other, why in self.excluded().items() if other != name})
+
+    def excluded(self) -> dict[str, str]:
+        """{capture: reason} of the captures that the operator excluded."""
+        return dict(self.decision("excluded") or {})
+
+    def decide(self, what: str, value: Any) -> None:
+        """Remember a decision, such as the rig or the target, as a plain value that JSON can hold."""
+        self._decide(what, lambda: value)
+
+    def decision(self, what: str) -> Any:
+        """What was decided last; None where nothing was. Raises DamagedError where it cannot be read."""
+        decisions, faults = _read_all(self.folder / "decisions.json")
+        if what in faults:
+            raise DamagedError(faults[what])
+        return decisions.get(what)
+
+    def valid_decision(self, what: str) -> Any:
+        """What was decided last, for what does without; None also where it is damaged, as `decision_faults` states."""
+        with contextlib.suppress(DamagedError):
+            return self.decision(what)
+        return None
+
+    def decision_faults(self) -> list[str]:
+        """What is damaged in the decisions, each with its remedy."""
+        try:
+            return list(_read_all(self.folder / "decisions.json")[1].values())
+        except DamagedError as error:
+            return [str(error)]
+
+    def _decide(self, what: str, make: Callable[[], Any]) -> None:
+        """Replace a decision by what ``make`` returns, which nobody else changes meanwhile; the others stay."""
+        self._require_writer()
+        path = self.folder / "decisions.json"
+        with self._decisions_lock:
+            replace_json(path, {**_read_all(path)[0], what: make()})
+
+    def _require_writer(self) -> None:
+        """Raise SessionError unless writing is allowed."""
+        raise NotImplementedError
+
+
+def _read_all(path: Path) -> tuple[dict[str, Any], dict[str, str]]:
+    """Return all decisions in a file, and of every one that is not of its type {decision: what is wrong, the remedy}.
+
+    None where the file is missing; DamagedError where it holds no decisions at all.
+    """
+    if not os.path.lexists(path):
+        return {}, {}
+    decisions, faults = read_json(path, _REMEDY), {}
+    for what, value in decisions.items():
+        try:
+            from_plain({what: value}, _Decisions)
+        except InputError as error:
+            faults[what] = f"{path} is damaged in its entry {what!r} ({error}): {_REMEDY}"
+    return decisions, faults
