@@ -1,8 +1,9 @@
 """Malformed input of every kind: `python -m tests.fuzz --minutes 10`, or `--count 2000 --seed 1`.
 
-Each case damages one file of a small session, or one that a command reads, runs one command on it in a forked child
-within 10 s and 2 GB, and is counted by its outcome. Right are: a refusal (exit status 1 to 3 and one printable message,
-the session unchanged), and success, where the damage does not matter to the command.
+Each case damages one file of a small session, or one that a command reads, or gives a command an impossible number,
+runs one command in a forked child within 10 s and 2 GB, and is counted by kind of file, command and outcome. Right are:
+a refusal (exit status 1 to 3 and one printable message, the session unchanged but for what is computed once and saved,
+`DERIVED`), and success, where the damage does not matter to the command.
 """
 
 import argparse
@@ -39,6 +40,7 @@ from slviewer.session.store import Session
 from slviewer.simulation.assets import asset_folder
 
 SECONDS, MEGABYTES = 10.0, 2048
+RIGHT = ("refused", "no effect")
 EVIL_TEXT = "a\x1b[2J\u202eb\x00c"
 VALUES: tuple[Any, ...] = (
     None, True, 0, -1, 1, 3, 0.5, 1e308, -1e308, float("nan"), float("inf"), float("-inf"), 10**9, 10**30, -(2**63),
@@ -60,8 +62,28 @@ COMMANDS = {
     "image": ("import frames images S2 --sequence frames.toml", "detect images/00.png --target circles:7x5:9"),
     "artefact": ("accept S --artefact artefact.toml",),
     "nominal": ("compare S scan part.stl", "compare S scan part.obj", "compare S scan part_2.ply"),
+    "number": (
+        "capture S new --rig rig.toml --port # --exposure-ms 10", "capture S new --rig rig.toml --exposure-ms #",
+        "capture S new --rig rig.toml --gain # --port 0", "capture S new --rig rig.toml --region # # # # --port 0",
+        "capture S new --rig rig.toml --exposures-ms 1 # --port 0", "preflight --rig rig.toml --gain # --port 0",
+        "calibrate S --target circles:7x5:9 --degree # --smoothing polynomial", "validate S --folds #",
+        "calibrate S --target circles:#x5:9", "calibrate S --target circles:7x5:#",
+        "reconstruct S scan --out c.ply --depth-range # #", "verify S scan --shape sphere --radius #",
+        "verify S scan --shape plane --range 1 #", "merge S scan scan_2 --start turntable --angle #",
+        "mesh S merge/1 --out m.stl --triangles #", "mesh S merge/1 --out m.stl --smooth #",
+        "mesh S merge/1 --out m.stl --fill-holes #", "compare S scan part.stl --tolerance #",
+        "compare S scan part.stl --reach #", "measure S scan point --at # #", "measure S scan sphere --ball 0 0 500 #",
+        "measure S scan plane --box # 0 0 1 1 #", "simulate S2 --poses 1 --scale #", "simulate S2 --poses #x",
+        "simulate S2 --poses 1 --scale 0.01 --seed #", "target circles:7x5:# --out t.pdf", "patterns --projector #x#",
+        "import opencv-calibration calibration.json S --force --camera #x#",
+        "import frames images S2 --sequence frames.toml --projector 96x#",
+    ),
 }  # fmt: skip
-"""The commands that read the files of a kind, S being the session."""
+"""The commands that read the files of a kind, S being the session; # is a number."""
+DERIVED = ("poses", "evidence", "trust", "compiled", "drift_reference")
+"""Results that a command computes on its way and saves, each whole and from sound inputs: they may be new when it ends
+with a refusal. Where a calibration is rejected, the attempt's verdict too."""
+REJECTED = 3
 
 
 @dataclass(frozen=True)
@@ -307,10 +329,13 @@ def _flip(data: bytes, rng: random.Random) -> bytes:
     return bytes(flipped)
 
 
-def damage(folder: Path, rng: random.Random) -> tuple[str, str]:
-    """Damage one file in a copy of the seed; returns what was done and the command to run."""
-    kind = rng.choice(("session",) * 6 + ("rig", "frames", "image", "artefact", "nominal"))
+def damage(folder: Path, rng: random.Random) -> tuple[str, str, str]:
+    """Damage one file in a copy of the seed; returns the kind of file, what was done, and the command to run."""
+    kind = rng.choice(("session",) * 6 + ("rig", "frames", "image", "artefact", "nominal", "number"))
     command = rng.choice(COMMANDS[kind])
+    if kind == "number":
+        numbers = (*NUMBERS, "-0", "1e308", "-1e308", "1e-320", "0.5", "9" * 5000, "1_0", "٣", "0x10", "")
+        return "number", "the number", " ".join(re.sub("#", lambda _: rng.choice(numbers), w) for w in command.split())
     names = {"rig": "rig.toml", "frames": "frames.toml", "artefact": "artefact.toml"}
     if kind == "session":
         files = [path for path in (folder / "S").rglob("*") if path.is_file() and not path.name.startswith(".lock")]
@@ -321,7 +346,10 @@ def damage(folder: Path, rng: random.Random) -> tuple[str, str]:
     else:
         path = folder / (names.get(kind) or next(w for w in command.split() if w.startswith("part")))
     how = _damage_file(path, rng)
-    return f"{path.relative_to(folder)}: {how}", command
+    if kind == "session":
+        parts = path.relative_to(folder / "S").parts
+        kind = "/".join([*parts[: 1 + (parts[0] == "results")], "chunk" if path.name.startswith("c.") else path.name])
+    return kind, f"{path.relative_to(folder)}: {how}", command
 
 
 def _damage_file(path: Path, rng: random.Random) -> str:
@@ -399,8 +427,11 @@ def run_case(folder: Path, command: str) -> Outcome:
         return Outcome("no effect", "")
     if code not in (1, 2, 3) or not message:
         return Outcome("wrong status", f"{code}: {message}")
-    if describe_tree(folder / "S") != before:
-        return Outcome("session changed", message)
+    derived = (*DERIVED, "calibration") if code == REJECTED else DERIVED
+    after = describe_tree(folder / "S")
+    changed = [name for name in before.keys() | after.keys() if before.get(name) != after.get(name)]
+    if any(not name.startswith(tuple(f"results/{each}" for each in derived)) for name in changed):
+        return Outcome("session changed", f"{message} ({min(changed)})")
     return Outcome("refused", message)
 
 
@@ -430,7 +461,11 @@ def describe_tree(folder: Path) -> dict[str, tuple[int, ...]]:
         for name in files:
             if not name.startswith(".lock"):
                 status = Path(parent, name).lstat()
-                described[str(Path(parent, name))] = (status.st_ino, status.st_size, status.st_mtime_ns)
+                described[str(Path(parent, name).relative_to(folder))] = (
+                    status.st_ino,
+                    status.st_size,
+                    status.st_mtime_ns,
+                )
     return described
 
 
@@ -442,8 +477,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     count = options.count or (2000 if options.minutes == float("inf") else 10**9)
-    outcomes: Counter[str] = Counter()
-    wrong: Counter[tuple[str, str, str]] = Counter()
+    outcomes: Counter[tuple[str, str, str]] = Counter()
     with tempfile.TemporaryDirectory() as root:
         seed, folder = Path(root, "seed"), Path(root, "case")
         seed.mkdir()
@@ -454,22 +488,28 @@ def main() -> int:
             if time.monotonic() > end:
                 break
             shutil.copytree(seed, folder, copy_function=os.link)
-            how, command = damage(folder, random.Random(f"{options.seed}-{number}"))
+            kind, how, command = damage(folder, random.Random(f"{options.seed}-{number}"))
             outcome = run_case(folder, command)
-            outcomes[outcome.kind] += 1
-            if outcome.kind not in ("refused", "no effect"):
-                wrong[outcome.kind, command.split()[0], re.sub(r"0x\w+|/tmp/\S+", "", outcome.message)[:160]] += 1
-                print(f"{number}: {outcome.kind}: {command} ({how}): {outcome.message[:300]}", flush=True)
+            outcomes[kind, command.split()[0], outcome.kind] += 1
+            if outcome.kind not in RIGHT:
+                print(f"{number}: {outcome.kind}: {command[:200]} ({how}): {outcome.message[:300]}", flush=True)
             shutil.rmtree(folder)
-    print(f"\n{sum(outcomes.values())} cases: " + ", ".join(f"{n} {kind}" for kind, n in outcomes.most_common()))
-    return int(bool(wrong))
+    bad = sum(n for (_, _, outcome), n in outcomes.items() if outcome not in RIGHT)
+    for name, column in (("file", 0), ("command", 1), ("outcome", 2)):
+        print(f"\nby {name}:")
+        for each in sorted({key[column] for key in outcomes}):
+            of_it = [(key, n) for key, n in outcomes.items() if key[column] == each]
+            wrong = sum(n for key, n in of_it if key[2] not in RIGHT)
+            print(f"  {each:<28} {sum(n for _, n in of_it):5}" + (f", {wrong} bad" if wrong else ""))
+    print(f"\n{sum(outcomes.values())} malformed inputs, {bad} bad (seed {options.seed})")
+    return int(bool(bad))
 
 
 def _warm_up(seed: Path, folder: Path) -> None:
     """Run every command on the sound seed, so that kernels are compiled, and print those that fail."""
     global SECONDS
     limit, SECONDS = SECONDS, 300.0
-    for command in dict.fromkeys(command for commands in COMMANDS.values() for command in commands):
+    for command in dict.fromkeys(c for kind, commands in COMMANDS.items() for c in commands if kind != "number"):
         shutil.copytree(seed, folder, copy_function=os.link)
         outcome = run_case(folder, command)
         if outcome.kind != "no effect":
