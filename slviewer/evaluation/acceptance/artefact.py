@@ -105,7 +105,7 @@ class Artefact:
                     f"unknown: use {', '.join(sorted(known))}"
                 )
         kind = given.get("kind")
-        if kind not in BALLS:
+        if not isinstance(kind, str) or kind not in BALLS:
             raise InputError(f"the artefact's kind is {kind!r}: use ball-bar, sphere or plane")
         calibrated, measured, limits = given.get("calibrated", {}), given.get("measured", {}), given.get("limits", {})
         spacing = None
@@ -121,7 +121,7 @@ class Artefact:
                 raise InputError(f"{len(diameters)} diameters are given for {BALLS[kind]}: give one a ball")
         captures = measured.get("captures")
         if isinstance(captures, list):
-            captures = {name: name for name in captures}
+            captures = {str(name): name for name in captures}  # any values: they are checked next
         if not isinstance(captures, Mapping) or not captures or not all(isinstance(c, str) for c in captures.values()):
             raise InputError(
                 'the artefact\'s file names no captures: in [measured] write captures = ["bar_*"], or a table '
