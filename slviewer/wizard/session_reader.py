@@ -199,7 +199,7 @@ class SessionReader:
             exports=list_exports(session),
             exposures_ms=self.exposures_ms(),
             is_linear=self.levels() is not None,
-            aligns_scans=bool(session.decision("align_scans")),
+            aligns_scans=bool(session.valid_decision("align_scans")),
             deleted_poses=tuple(session.deleted_captures("calibration")),
             deleted_scans=tuple(session.deleted_captures("scan")),
             faults=tuple(dict.fromkeys(self._faults)),
