@@ -1,0 +1,205 @@
+"""Laws of every reader of files: any bytes and any values give a typed value or one of our errors, nothing else."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from slviewer.errors import SlviewerError
+from slviewer.fringe.presets import phase_steps
+from slviewer.fringe.sequence import PatternSequence
+from slviewer.pipeline.accept import read_artefact
+from slviewer.pipeline.rig_presets import load_rig
+from slviewer.printable import escape_controls
+from slviewer.session.importers.frames import read_description
+from slviewer.session.importers.images import read_image
+from slviewer.session.nominal import read_nominal
+from slviewer.session.ply import read_ply, write_ply
+from slviewer.session.reading import read_toml
+from slviewer.session.stack import describe_stack
+from slviewer.session.store import Session
+from slviewer.session.toml import format_value
+from slviewer.simulation.assets import asset_folder
+
+settings.register_profile(
+    "readers",
+    max_examples=40,
+    deadline=None,
+    derandomize=True,
+    database=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
+)
+settings.load_profile("readers")
+
+_TEXTS = st.text(max_size=8) | st.sampled_from(["\x1b[2J", "\u202e", "~nobody", "../x", "9" * 500])
+_NUMBERS = st.floats() | st.integers() | st.sampled_from([10**30, 2**63, -1, 1e308, float("nan"), float("inf")])
+_VALUES = st.recursive(
+    st.none() | st.booleans() | _NUMBERS | _TEXTS,
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(_TEXTS, inner, max_size=4),
+    max_leaves=12,
+)
+
+
+def _read(read: Callable[[], Any]) -> Any:
+    """Return what a reader returns; None where it raises one of our errors, whose message a terminal can show."""
+    try:
+        return read()
+    except SlviewerError as error:
+        text = escape_controls(str(error))
+        assert text.strip() and all(c.isprintable() or c in "\n\t" for c in text)
+        return None
+
+
+@st.composite
+def _damaged(draw: st.DrawFn, sound: Any) -> Any:
+    """Draw plain values like ``sound`` ones, with one of them, at any depth, replaced or missing."""
+    if not isinstance(sound, dict | list) or not sound or draw(st.integers(0, 9)) == 0:
+        return draw(_VALUES)
+    key = draw(st.sampled_from(sorted(sound) if isinstance(sound, dict) else range(len(sound))))
+    copy = sound.copy()
+    if draw(st.integers(0, 9)) == 0:
+        del copy[key]
+    else:
+        copy[key] = draw(_damaged(sound[key]))
+    return copy
+
+
+def _damaged_bytes(sound: bytes) -> st.SearchStrategy[bytes]:
+    """Return a strategy of any bytes, and of ``sound`` ones cut short or with some replaced."""
+    cut = st.integers(0, len(sound)).map(lambda n: sound[:n])
+    patch = st.tuples(st.integers(0, len(sound)), st.binary(max_size=6))
+    return st.binary(max_size=200) | cut | patch.map(lambda p: sound[: p[0]] + p[1] + sound[p[0] + len(p[1]) :])
+
+
+@pytest.fixture
+def full(session: Session) -> Session:
+    """A session with a capture, a decision and a result with an array."""
+    sequence = PatternSequence((96, 64), tuple(phase_steps("x", 4, 96.0)))
+    session.save_capture("scan", "scan", sequence, np.zeros((4, 6, 8), np.uint8), source="test")
+    session.decide("excluded", {"scan": "dark"})
+    session.decide("levels", [0, 255])
+    meta = {"kind": "point", "name": "a", "source": "scan", "model": "stereo", "time": "", "data": {"scale": 1.0}}
+    session.save_result("measurements/m1", {**meta, "of": [], "inputs": session.input_hashes("scan")}, {"K": np.eye(3)})
+    return session
+
+
+def _use_capture(store: Session) -> None:
+    """Use every entry of a capture."""
+    capture = store.load_capture("scan")
+    assert capture.frames.shape == (4, capture.size[1], capture.size[0]) and isinstance(capture.exposures_ms, tuple)
+
+
+def _use_decisions(store: Session) -> None:
+    """Use decisions."""
+    assert all(isinstance(why, str) for why in store.excluded().values())
+    assert all(0 <= level <= 255 for level in store.decision("levels") or ())
+
+
+def _use_result(store: Session) -> None:
+    """Use a result's meta and arrays, and its state."""
+    meta, arrays = store.load_result("measurements/m1")
+    assert isinstance(meta["name"], str) and all(isinstance(array, np.ndarray) for array in arrays.values())
+    assert store.state_of("measurements/m1") in ("fresh", "stale")
+
+
+_RECORDS: dict[str, Callable[[Session], object]] = {
+    "captures/scan/capture.json": _use_capture,
+    "captures/scan/frames.zarr/zarr.json": _use_capture,
+    "decisions.json": _use_decisions,
+    "results/measurements/m1/meta.json": _use_result,
+    "session.json": lambda store: Session.open(store.folder).close(),
+}
+
+
+@pytest.mark.parametrize("name", _RECORDS)
+@given(data=st.data())
+def test_a_damaged_record_is_refused_or_typed(full: Session, name: str, data: st.DataObject) -> None:
+    path = full.folder / name
+    sound = path.read_bytes()
+    _RECORDS[name](full)
+    damage = _damaged(json.loads(sound)).map(lambda values: json.dumps(values).encode()) | _damaged_bytes(sound)
+    path.write_bytes(data.draw(damage))
+    try:
+        _read(lambda: _RECORDS[name](full))
+    finally:
+        path.write_bytes(sound)
+
+
+@given(data=_damaged({"shape": [4, 6, 8]}))
+def test_a_stack_is_never_larger_than_its_files(full: Session, data: Any) -> None:
+    path = full.folder / "captures/scan/frames.zarr/zarr.json"
+    sound = path.read_text()
+    path.write_text(json.dumps({**json.loads(sound), **(data if isinstance(data, dict) else {})}))
+    described = _read(lambda: describe_stack(path.parent))
+    path.write_text(sound)
+    assert described is None or all(1 <= extent <= 1 << 16 for extent in described[0])
+
+
+def _asset(name: str) -> dict[str, Any]:
+    """Return the tables of a TOML file that comes with the program."""
+    kind, _, file = name.partition("/")
+    return read_toml(asset_folder(kind) / file)
+
+
+_FRAMES = [frame.to_dict() | {"file": f"{i}.png"} for i, frame in enumerate(phase_steps("x", 3, 96.0))]
+_TABLES: dict[str, tuple[dict[str, Any], Callable[[Path], object]]] = {
+    "frames": ({"projector": "96x64", "phase_sign": 1, "frame": _FRAMES}, read_description),
+    "artefact": (_asset("artefacts/sphere_196.toml"), read_artefact),
+    "rig": (_asset("rigs/simulated.toml"), load_rig),
+    "any": ({"a": {"b": [1]}}, read_toml),
+}
+
+
+@pytest.mark.parametrize("name", _TABLES)
+@given(data=st.data())
+def test_a_damaged_table_is_refused_or_typed(tmp_path: Path, name: str, data: st.DataObject) -> None:
+    sound, read = _TABLES[name]
+    path = tmp_path / "table.toml"
+    path.write_bytes(_to_toml(sound))
+    read(path)
+    values = data.draw(_damaged(sound) | _damaged_bytes(_to_toml(sound)))
+    path.write_bytes(values if isinstance(values, bytes) else _to_toml(values))
+    _read(lambda: read(path))
+
+
+def _to_toml(values: Any) -> bytes:
+    """Return values, without those that TOML has not, as TOML."""
+
+    def known(value: Any) -> Any:
+        """Return a value that TOML can hold."""
+        if isinstance(value, dict):
+            return {key: known(each) for key, each in value.items() if each is not None}
+        return [known(each) for each in value if each is not None] if isinstance(value, list) else value
+
+    table = known(values) if isinstance(values, dict) else {"a": known(values if values is not None else "")}
+    return "".join(f"{format_value(key)} = {format_value(value)}\n" for key, value in table.items()).encode()
+
+
+@pytest.mark.parametrize("kind", ["ply", "stl", "obj", "png", "tif", "nominal.ply"])
+@given(data=st.data())
+def test_a_damaged_file_of_points_or_pixels_is_refused_or_read(tmp_path: Path, kind: str, data: st.DataObject) -> None:
+    path = tmp_path / f"file.{kind}"
+    points = np.array([[0, 0, 0], [9, 0, 0], [0, 9, 0], [0, 0, 9]], np.float32)
+    faces = np.array([[0, 1, 2], [0, 1, 3]])
+    read: Callable[[Path], Any]
+    if kind in ("png", "tif"):
+        sound, read = cv2.imencode(f".{kind}", np.arange(48, dtype=np.uint8).reshape(6, 8))[1].tobytes(), read_image
+    elif kind == "stl":
+        facets = np.zeros(2, np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")]))
+        facets["corners"] = points[faces]
+        sound, read = bytes(80) + (2).to_bytes(4, "little") + facets.tobytes(), read_nominal
+    elif kind == "obj":
+        sound, read = b"v 0 0 0\nv 9 0 0\nv 0 9 0\nv 0 0 9\nf 1 2 3\nf 1 2 4\n", read_nominal
+    else:
+        write_ply(path, points, faces=faces)
+        sound, read = path.read_bytes(), read_ply if kind == "ply" else read_nominal
+    path.write_bytes(sound)
+    read(path)
+    path.write_bytes(data.draw(_damaged_bytes(sound)))
+    _read(lambda: read(path))
