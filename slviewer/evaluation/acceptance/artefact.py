@@ -105,7 +105,7 @@ class Artefact:
                     f"unknown: use {', '.join(sorted(known))}"
                 )
         kind = given.get("kind")
-        if not isinstance(kind, str) or kind not in BALLS:
+        if kind not in tuple(BALLS):  # it may be of any type
             raise InputError(f"the artefact's kind is {kind!r}: use ball-bar, sphere or plane")
         calibrated, measured, limits = given.get("calibrated", {}), given.get("measured", {}), given.get("limits", {})
         spacing = None
