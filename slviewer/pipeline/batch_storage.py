@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from slviewer.errors import InputError, SessionError
+from slviewer.session.layout import is_session
 from slviewer.session.reading import expand_user
-from slviewer.session.store import is_session
 
 
 def is_remote(address: str) -> bool:

@@ -26,8 +26,9 @@ from slviewer.session.importers.guessed_description import GuessedDescription
 from slviewer.session.importers.images import Channel
 from slviewer.session.importers.imported import ImportableRecording, Imports, Skipped, none_usable
 from slviewer.session.importers.layouts import LAYOUTS, detect_layout, find_description
+from slviewer.session.layout import is_session
 from slviewer.session.reading import expand_user
-from slviewer.session.store import Session, is_session
+from slviewer.session.store import Session
 
 Role = Literal["calibration", "scan"]
 Size = str | tuple[int, int]

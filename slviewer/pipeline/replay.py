@@ -13,8 +13,9 @@ from slviewer.fringe.sequence import PatternSequence
 from slviewer.pipeline.feedback import ignore_warnings
 from slviewer.pipeline.import_captures import check_imported_capture, find_captures
 from slviewer.session.importers.imported import ImportableRecording
+from slviewer.session.layout import is_session
 from slviewer.session.reading import expand_user
-from slviewer.session.store import Session, is_session
+from slviewer.session.store import Session
 
 Shot = tuple[np.ndarray, PatternSequence]
 

@@ -8,7 +8,8 @@ from slviewer.errors import SessionError
 from slviewer.session.atomic import disk_errors, replace_json
 from slviewer.session.reading import expand_user, read_json
 
-SCHEMA = 1
+SCHEMA = 2
+"""Of new sessions: 1, and since 2 frames and arrays have checksums, which programs that know only 1 do not read."""
 
 
 def is_session(path: str | Path) -> bool:
@@ -59,6 +60,13 @@ def create_layout(folder: Path) -> None:
             (folder / inner).mkdir(exist_ok=True)
     created = datetime.now(UTC).isoformat(timespec="seconds")
     replace_json(folder / "session.json", {"schema": SCHEMA, "created": created, "program": f"slviewer {__version__}"})
+
+
+def raise_schema(folder: Path) -> None:
+    """State the newest schema in an older session, before anything is saved that needs it."""
+    described = read_json(folder / "session.json")
+    if described["schema"] < SCHEMA:
+        replace_json(folder / "session.json", {**described, "schema": SCHEMA})
 
 
 def remove_layout(folder: Path) -> bool:

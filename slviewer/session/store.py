@@ -10,7 +10,7 @@ import numpy as np
 
 from slviewer.errors import DamagedError, InputError, SessionError
 from slviewer.fringe.sequence import PatternSequence
-from slviewer.session import atomic
+from slviewer.session import atomic, layout
 from slviewer.session.capture import (
     Capture,
     Comparison,
@@ -22,7 +22,6 @@ from slviewer.session.capture import (
     write_capture,
 )
 from slviewer.session.decisions import Decisions
-from slviewer.session.layout import create_layout, inner_folders, is_session, new_folder, remove_layout, session_folder
 from slviewer.session.lock import WriterLock
 from slviewer.session.names import is_safe_name, natural_key, safe_name, safe_path
 from slviewer.session.reading import decoding, expand_user
@@ -55,12 +54,12 @@ class Session(Decisions):
     @classmethod
     def create(cls, path: str | Path) -> "Session":
         """A new session, open for writing, in a new or empty folder; SessionError where something is there already."""
-        folder, is_new_folder = new_folder(path)
+        folder, is_new_folder = layout.new_folder(path)
         lock = WriterLock(folder)
         lock.acquire()
         try:
-            new_folder(path)  # another process may have made one before the lock was taken
-            create_layout(folder)
+            layout.new_folder(path)  # another process may have made one before the lock was taken
+            layout.create_layout(folder)
         except BaseException:
             lock.release()
             raise
@@ -75,12 +74,12 @@ class Session(Decisions):
         Raises SessionError where there is no session, where it is damaged or of a newer schema, or where another
         process is writing to it.
         """
-        folder = session_folder(path)
+        folder = layout.session_folder(path)
         session = cls(folder, WriterLock(folder) if write else None)
         try:
             if session._lock is not None:
                 session._lock.acquire()
-                session_folder(path)  # its creator may have removed it before the lock was taken
+                layout.session_folder(path)  # its creator may have removed it before the lock was taken
             session._recover()
         except BaseException:
             session.close()
@@ -91,11 +90,11 @@ class Session(Decisions):
     def open_or_create(cls, path: str | Path) -> "Session":
         """The session in a folder, open for writing; made where the folder is missing or empty."""
         for _ in range(5):  # attempts: another process may create or remove it meanwhile
-            was_session = is_session(path)
+            was_session = layout.is_session(path)
             try:
                 return cls.open(path, write=True) if was_session else cls.create(path)
             except SessionError:
-                if is_session(path) == was_session and expand_user(path).exists():
+                if layout.is_session(path) == was_session and expand_user(path).exists():
                     raise
         return cls.create(path)
 
@@ -104,7 +103,7 @@ class Session(Decisions):
         if not self._created or self._lock is None or not self._lock.held:
             return
         with contextlib.suppress(OSError):  # what cannot be removed stays
-            if remove_layout(self.folder):
+            if layout.remove_layout(self.folder):
                 self._lock.release_and_remove()
                 if self._created == "folder":
                     self.folder.rmdir()
@@ -140,7 +139,7 @@ class Session(Decisions):
 
     def taken_names(self) -> list[str]:
         """Names that a new capture cannot have: of the captures, and of other folders in their place."""
-        return sorted(inner_folders(self.folder / "captures"), key=natural_key)
+        return sorted(layout.inner_folders(self.folder / "captures"), key=natural_key)
 
     def captures(self, role: Role | None = None) -> list[Capture]:
         """The captures (of one role) in the order of `capture_names`, without damaged ones; frames stay on disk."""
@@ -200,6 +199,8 @@ class Session(Decisions):
         those of the same name are replaced, or the names of those that are. If the program dies, the next one to open
         the session completes those that were written.
         """
+        self._require_writer()
+        layout.raise_schema(self.folder)
         staged: dict[str, Path] = {}
         try:
             for new in captures:

@@ -16,7 +16,8 @@ from slviewer.pipeline.merge import merge
 from slviewer.pipeline.poses import load_observations
 from slviewer.pipeline.simulate import TARGET, TRUTH, simulate
 from slviewer.pipeline.verify import Verification, verify
-from slviewer.session.store import Session, is_session
+from slviewer.session.layout import is_session
+from slviewer.session.store import Session
 from slviewer.validation.reproduction import MODELS, Reproduction, write_reproduction
 
 QUICK_SCALE = 0.5

@@ -117,7 +117,8 @@ def test_report_and_inspect(calibrated: dict, session: Path, run: Run, tmp_path:
     html = page.read_text()
     assert "pose_01" in html and 'src="http' not in html
     status, text, _ = run("inspect", session)
-    assert status == 0 and ": 27 captures" in text.splitlines()[0] and "calibration pixelwise: from 8 poses, fresh" in text
+    assert status == 0 and ": 27 captures" in text.splitlines()[0]
+    assert "calibration pixelwise: from 8 poses, fresh" in text
 
 
 def test_reproduce_remakes_the_letters_tables_and_figures(

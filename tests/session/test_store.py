@@ -320,8 +320,8 @@ def test_sessions_from_elsewhere(tmp_path):
         Session.create(folder)
     about = folder / "session.json"
     good = json.loads(about.read_text())
-    about.write_text(json.dumps({**good, "schema": 2}))
-    with pytest.raises(SessionError, match=r"2.*1"):
+    about.write_text(json.dumps({**good, "schema": 3}))
+    with pytest.raises(SessionError, match=r"3.*2"):
         Session.open(folder)
     about.write_text(json.dumps({**good, "schema": "one"}))
     with pytest.raises(SessionError, match="schema"):
@@ -339,3 +339,16 @@ def test_a_sequence_with_every_kind_survives(session, sequence, noise):
     )
     session.save_capture("a", "scan", mixed, noise(1, 7), source="")
     assert session.load_capture("a").sequence == mixed
+
+
+def test_a_session_of_the_first_schema_is_read_and_raised_when_it_is_saved_in(session, sequence, frames):
+    path = session.folder / "session.json"
+    described = json.loads(path.read_text())
+    assert described["schema"] == 2
+    session.save_capture("a", "scan", sequence, frames, source="")
+    path.write_text(json.dumps({**described, "schema": 1}))
+    session.close()
+    with Session.open(session.folder, write=True) as store:
+        assert store.capture_names() == ["a"] and json.loads(path.read_text())["schema"] == 1
+        store.save_capture("b", "scan", sequence, frames, source="")
+    assert json.loads(path.read_text()) == described
