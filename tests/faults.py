@@ -2,12 +2,14 @@
 
 A command runs on a copy of a small session, in a forked child whose n-th change of the disk (opening a file to write,
 writing, syncing, renaming, making or removing) is its death, or fails. A death is a kill, or a loss of power, which
-takes what was not synced: files are emptied, and renames undone. Afterwards the session must open, hold every complete
-capture undamaged, and one calibration, wholly the old or wholly the new; and the same command must then complete.
+takes what was not synced: files are emptied, and renames and replacements undone. Afterwards the session must open,
+hold every complete capture undamaged, and one calibration, wholly the old or wholly the new; and the same command must
+then complete.
 """
 
 import argparse
 import builtins
+import contextlib
 import errno
 import io
 import os
@@ -19,7 +21,6 @@ import tempfile
 import traceback
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -106,7 +107,7 @@ class WatchedFile:
         self._file.close()
 
 
-@contextmanager
+@contextlib.contextmanager
 def watching(disk: Disk) -> Iterator[pytest.MonkeyPatch]:
     """Context manager: everything that changes files is counted by the disk."""
     opened = builtins.open
@@ -143,7 +144,8 @@ class Machine(Disk):
         super().__init__(at, code)
         self._loses_power, self._process = loses_power, os.getpid()
         self._unsynced: list[Path] = []
-        self._renamed: list[tuple[Path, Path]] = []
+        self._renamed: list[tuple[Path, Path, Path | None]] = []  # the last: a copy of what was replaced
+        self._copies = Path.cwd() if loses_power else None
         self._system = {name: getattr(os, name) for name in (*CHANGES, "truncate")}
 
     def call(self, name: str, *paths: Any) -> None:
@@ -154,14 +156,18 @@ class Machine(Disk):
         elif name == "fsync":
             synced = Path(os.readlink(f"/proc/self/fd/{paths[0]}"))
             self._unsynced = [path for path in self._unsynced if path != synced]
-            self._renamed = [(a, b) for a, b in self._renamed if b.parent != synced]
+            self._renamed = [(a, b, old) for a, b, old in self._renamed if b.parent != synced]
         elif name in ("rename", "replace"):
             source, target = (Path(path).absolute() for path in paths)
             self._unsynced = [
                 target / path.relative_to(source) if path.is_relative_to(source) else path for path in self._unsynced
             ]
-            if not target.exists():
-                self._renamed.append((source, target))
+            old = None
+            if self._copies is not None and target.is_file():
+                old = self._copies / f"copy_{len(self.calls)}"
+                os.link(target, old)
+            if old is not None or not target.exists():
+                self._renamed.append((source, target, old))
 
     def die(self) -> None:
         """Kill the process; before, take what a loss of power takes."""
@@ -169,23 +175,21 @@ class Machine(Disk):
             for path in self._unsynced:
                 if path.is_file():
                     self._system["truncate"](path, 0)
-            for source, target in reversed(self._renamed):
+            for source, target, old in reversed(self._renamed):
                 if target.exists() and not source.exists() and source.parent.exists():
                     self._system["rename"](target, source)
+                    if old is not None:
+                        os.link(old, target)
         os.kill(self._process, signal.SIGKILL)
 
 
-def make_seed(folder: Path) -> None:
+def make_seed(folder: Path, poses: int = 7) -> None:
     """Make a small calibrated session S with a calibration in its trash, and the files that commands read beside it."""
     from tests import fuzz
 
-    (folder / "other").mkdir()
-    fuzz.make_seed(folder / "other")
-    for name in ("images", "frames.toml"):
-        (folder / "other" / name).rename(folder / name)
-    shutil.rmtree(folder / "other")
+    fuzz.write_frames(folder)
     session = folder / "S"
-    (folder / "rig.toml").write_text('what = "small"\ndriver = "simulated"\nscale = 0.1\n')
+    (folder / "rig.toml").write_text('what = "small"\ndriver = "simulated"\npreset = "letter"\nscale = 0.1\nseed = 0\n')
     (folder / "sphere.toml").write_text(
         'kind = "sphere"\nname = "sphere"\ncertificate = "none"\n'
         "[calibrated]\ndiameter_mm = 196.0\ndiameter_U_mm = 0.01\nform_mm = 0.01\nform_U_mm = 0.01\n"
@@ -194,7 +198,7 @@ def make_seed(folder: Path) -> None:
         "[limits]\nform_mm = 5.0\nsize_mm = 5.0\n"
     )
     calibrate = COMMANDS[3].replace(" S ", f" {session} ").split()
-    run_sound(f"simulate {session} --scale 0.2 --poses 7".split())
+    run_sound(f"simulate {session} --scale 0.2 --poses {poses}".split())
     with Session.open(session, write=True) as store:
         for name in store.capture_names("scan"):
             if name not in ("object_r1", "object_r2", "sphere_1", "sphere_2"):
@@ -204,20 +208,35 @@ def make_seed(folder: Path) -> None:
     run_sound(["export", str(session), "calibration", "--out", str(folder / "calibration.yml")])
     run_sound(["import", "opencv-calibration", str(folder / "calibration.yml"), str(session), "--force"])
     with Session.open(session, write=True) as store:
-        store.exclude("pose_07", "so that the next calibration is another")
+        store.exclude(f"pose_{poses:02d}", "so that the next calibration is another")
     run_sound(calibrate)
     with Session.open(session, write=True) as store:
-        store.include("pose_07")
+        store.include(f"pose_{poses:02d}")
+
+
+def make_in_child(make: Callable[[], None]) -> None:
+    """Run a function in a forked child: threads of compiled code must not run where later children are forked."""
+    child = os.fork()
+    if not child:
+        status = 1
+        try:
+            make()
+            status = 0
+        except BaseException:
+            traceback.print_exc()
+        finally:
+            os._exit(status)
+    if os.waitpid(child, 0)[1]:
+        raise RuntimeError("the session could not be made")
 
 
 def run_sound(arguments: list[str]) -> None:
     """Run a command that must succeed, silently."""
-    with open(os.devnull, "w") as nowhere, pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sys, "stdout", nowhere)
-        patch.setattr(sys, "stderr", nowhere)
+    written = io.StringIO()
+    with contextlib.redirect_stdout(written), contextlib.redirect_stderr(written):
         status = cli.main(arguments)
     if status:
-        raise RuntimeError(f"{' '.join(arguments)}: status {status}")
+        raise RuntimeError(f"{' '.join(arguments)}: status {status}: {written.getvalue()}")
 
 
 def run_child(folder: Path, command: str, make: Callable[[], Machine]) -> tuple[int, str]:
@@ -284,18 +303,15 @@ def run(kills: int, faults: int, seed: int, commands: tuple[str, ...] = COMMANDS
     """Run the cases, print those that are wrong, and return the number of each outcome."""
     rng = random.Random(seed)
     outcomes: Counter[str] = Counter()
+    by_command: dict[str, Counter[str]] = {command: Counter() for command in commands}
     kinds = [("kill", KILL, False), ("power", KILL, True)] * (kills // 2)
     kinds += [(name, code, False) for name, code in [*FAULTS.items()][1:]] * -(-faults // 3)
     kinds = kinds[: kills // 2 * 2 + faults]
+    rng.shuffle(kinds)  # so that every command meets every kind
     with tempfile.TemporaryDirectory() as root:
         sound, folder = Path(root, "seed"), Path(root, "case")
         sound.mkdir()
-        child = os.fork()  # threads of compiled code must not be running when later children are forked
-        if not child:
-            make_seed(sound)
-            os._exit(0)
-        if os.waitpid(child, 0)[1]:
-            raise RuntimeError("the session could not be made")
+        make_in_child(lambda: make_seed(sound))
         before, counts = describe(sound / "S"), {}
         for command in commands:  # compiles, and counts the places to fail at
             shutil.copytree(sound, folder)
@@ -313,10 +329,14 @@ def run(kills: int, faults: int, seed: int, commands: tuple[str, ...] = COMMANDS
             wrong = examine(folder, before, command)
             if "Traceback" in text:
                 wrong = wrong or f"traceback: {text.strip().splitlines()[-1]}"
-            outcomes["wrong" if wrong else "died" if status < 0 else "refused" if status else "completed"] += 1
+            outcome = "wrong" if wrong else "died" if status < 0 else "refused" if status else "completed"
+            outcomes[outcome] += 1
+            by_command[command][f"{kind}: {outcome}"] += 1
             if wrong:
                 print(f"{number}: {command}: {kind} at {at} of {counts[command]}: {wrong}", flush=True)
             shutil.rmtree(folder)
+    for command, counted in by_command.items():
+        print(f"{command}: " + ", ".join(f"{n} {what}" for what, n in sorted(counted.items())))
     return outcomes
 
 
