@@ -73,6 +73,11 @@ def export_folder(address: str, batch: str) -> Iterator[Path]:
                 arriving = f"{root}/exports/.batch-{batch}-{secrets.token_hex(4)}-{path.name}"
                 fs.put_file(str(path), arriving)
                 fs.mv(arriving, f"{root}/exports/{path.name}")
+        except FileNotFoundError as error:
+            raise SessionError(
+                f"a file for {address} disappeared while it was delivered ({error}): the batch was ended meanwhile, or "
+                "another program removes files there; run the batch again"
+            ) from error
         except OSError as error:
             raise SessionError(
                 f"{address} cannot be written ({error}): check its permissions and free space"

@@ -146,15 +146,21 @@ class Capture:
         path = self.folder / "texture.png"
         if not self.meta.get("texture"):
             return None
-        import cv2
+        from slviewer.session.importers.images import read_image
 
-        image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-        if image is None or image.shape != (self.size[1], self.size[0], 3):
+        fault, shape = "", (self.size[1], self.size[0], 3)
+        try:
+            image = read_image(path)
+        except InputError as error:
+            fault = str(error)
+        else:
+            fault = "" if image.shape == shape else f"its shape is {image.shape}, not {shape}"
+        if fault:
             raise DamagedError(
-                f"{self.name}: its texture is damaged ({path} is missing or cannot be decoded): restore this file from "
-                "a copy, or import or record the capture again"
+                f"{self.name}: its texture is damaged ({path}: {fault}): restore this file from a copy, or import or "
+                "record the capture again"
             )
-        return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+        return np.ascontiguousarray(image[..., ::-1])
 
 
 _Extent = Annotated[int, msgspec.Meta(ge=1, le=1 << 16)]

@@ -8,6 +8,7 @@ import numpy as np
 
 from slviewer import __version__
 from slviewer.errors import InputError
+from slviewer.printable import escape_controls
 from slviewer.session.atomic import arriving_file
 from slviewer.session.reading import MAX_CLOUD_BYTES, decoding, read_file
 
@@ -120,7 +121,7 @@ def _parse_ply(path: Path, data: bytes, end: int, lines: list[list[str]]) -> Ply
 
 def to_ascii(note: str) -> str:
     """Convert a sentence to one line of printable ASCII, for the comments of a file."""
-    return " ".join(note.encode("ascii", "replace").decode().split())
+    return " ".join(escape_controls(note).encode("ascii", "replace").decode().split())
 
 
 def replace_nan(name: str, values: np.ndarray) -> np.ndarray:
