@@ -73,6 +73,10 @@ class Disk:
             return
         raise OSError(self._code, os.strerror(self._code))
 
+    def concerns(self, path: Any) -> bool:
+        """Whether changes of a path are counted."""
+        return True
+
     def die(self) -> None:
         """End the program."""
         raise Killed
@@ -117,14 +121,15 @@ def watching(disk: Disk) -> Iterator[pytest.MonkeyPatch]:
 
         def call(*arguments: Any, **options: Any) -> Any:
             """Count the call, and make it."""
-            disk.call(name, *arguments)
+            if disk.concerns(arguments[0]):
+                disk.call(name, *arguments)
             return function(*arguments, **options)
 
         return call
 
     def watched_open(path: Any, mode: str = "r", *arguments: Any, **options: Any) -> Any:
         """Open a file; one for writing is counted and watched."""
-        if not set(mode) & set("wxa+"):
+        if not set(mode) & set("wxa+") or not disk.concerns(path):
             return opened(path, mode, *arguments, **options)
         disk.call("open", path)
         return WatchedFile(opened(path, mode, *arguments, **options), disk)
@@ -145,8 +150,13 @@ class Machine(Disk):
         self._loses_power, self._process = loses_power, os.getpid()
         self._unsynced: list[Path] = []
         self._renamed: list[tuple[Path, Path, Path | None]] = []  # the last: a copy of what was replaced
-        self._copies = Path.cwd() if loses_power else None
+        self._folder = Path.cwd()
         self._system = {name: getattr(os, name) for name in (*CHANGES, "truncate")}
+
+    def concerns(self, path: Any) -> bool:
+        """Whether a path, or what is open under a number, is in the folder of the case: compiled code is elsewhere."""
+        place = Path(os.readlink(f"/proc/self/fd/{path}") if isinstance(path, int) else os.fsdecode(path))
+        return place.absolute().is_relative_to(self._folder)
 
     def call(self, name: str, *paths: Any) -> None:
         """Count a call, and note what a loss of power would take."""
@@ -163,8 +173,8 @@ class Machine(Disk):
                 target / path.relative_to(source) if path.is_relative_to(source) else path for path in self._unsynced
             ]
             old = None
-            if self._copies is not None and target.is_file():
-                old = self._copies / f"copy_{len(self.calls)}"
+            if self._loses_power and target.is_file():
+                old = self._folder / f"copy_{len(self.calls)}"
                 os.link(target, old)
             if old is not None or not target.exists():
                 self._renamed.append((source, target, old))
@@ -299,7 +309,7 @@ def examine(folder: Path, before: tuple[set[str], dict[str, str]], command: str)
     return ""
 
 
-def run(kills: int, faults: int, seed: int, commands: tuple[str, ...] = COMMANDS) -> Counter[str]:
+def run(kills: int, faults: int, seed: int, commands: tuple[str, ...]) -> Counter[str]:
     """Run the cases, print those that are wrong, and return the number of each outcome."""
     rng = random.Random(seed)
     outcomes: Counter[str] = Counter()
@@ -346,8 +356,10 @@ def main() -> int:
     parser.add_argument("--kills", type=int, default=300, help="deaths, half of them by a loss of power")
     parser.add_argument("--faults", type=int, default=100, help="full disks, I/O errors and read-only disks")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--commands", nargs="*", help="names of some of the commands")
     options = parser.parse_args()
-    outcomes = run(options.kills, options.faults, options.seed)
+    commands = tuple(each for each in COMMANDS if not options.commands or each.split()[0] in options.commands)
+    outcomes = run(options.kills, options.faults, options.seed, commands)
     print(f"\n{sum(outcomes.values())} cases: " + ", ".join(f"{n} {kind}" for kind, n in outcomes.most_common()))
     return int(bool(outcomes["wrong"]))
 
