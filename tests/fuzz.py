@@ -53,7 +53,7 @@ COMMANDS = {
         "verify S object_r1 --shape plane",
         "check S pose_01", "validate S", "mesh S merge/1 --out m.stl",
         "merge S object_r1 object_r2 --reference object_r1 --out m.ply",
-        "calibrate S --target circles:21x16:9 --models stereo pixelwise", "measure S object_r1 point --at 3 3",
+        "calibrate S --target circles:21x16:9 --models stereo pixelwise", "measure S object_r1 point --at 160 120",
         "compare S object_r1 part.stl",
         "import opencv-calibration calibration.json S --force", "preflight --capture S object_r1",
     ),
@@ -97,13 +97,13 @@ class Outcome:
 
 def make_seed(folder: Path) -> None:
     """Make a small session with a result of every kind, and the files that commands read beside it."""
-    faults.make_seed(folder, poses=9)
+    faults.make_seed(folder, poses=10)
     session = folder / "S"
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         for command in (
             "accept S --artefact sphere.toml --apply-scale",
-            "check S pose_09",
+            "check S pose_10",
             "merge S object_r1 object_r2 --reference object_r1",
             "align S object_r1 object_r2",
             "measure S object_r1 point --at 160 120",
@@ -114,7 +114,7 @@ def make_seed(folder: Path) -> None:
     with Session.open(session, write=True) as store:
         tasks.reconstruct_capture(store, "object_r1", None, Reporter(lambda: None), print)
         tasks.verify_captures(store, ["sphere_1"], "sphere", None, Reporter(lambda: None), print)
-        store.exclude("pose_09", "blurred")
+        store.exclude("pose_10", "blurred")
         store.decide("names", {"object_r1": "part"})
     part = trimesh.load(folder / "part.stl")
     for name in ("part.obj", "part_2.ply"):
