@@ -110,7 +110,7 @@ class Board:
                 f"board '{notation}' has {len(fields)} fields after the kind: give columns x rows and the "
                 f"{'side of a square' if kind in ('chessboard', 'charuco') else 'pitch'} in mm, as in '{example}'"
             )
-        size = re.fullmatch(r"\s*(\d+)\s*[xX×]\s*(\d+)\s*", fields[0])
+        size = re.fullmatch(r"\s*(\d{1,6})\s*[xX×]\s*(\d{1,6})\s*", fields[0])
         if not size:
             raise InputError(f"board '{notation}': '{fields[0]}' is not columns x rows, as in '{example}'")
         pitch = _parse_millimetres(notation, fields[1], example)

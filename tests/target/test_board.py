@@ -40,6 +40,7 @@ def test_odd_lengths_keep_every_digit() -> None:
         ("circles", "0 fields"),
         ("circles:21x16", "columns x rows and the pitch"),
         ("circles:21:9", "'21' is not columns x rows"),
+        (f"circles:{'9' * 5000}x16:9", "is not columns x rows"),
         ("circles:21x16:9:3", "3 fields"),
         ("circles:21x16:wide", "'wide' is not a length"),
         ("circles:21x16:-9", "'-9' is not a length"),
