@@ -43,17 +43,20 @@ _VIEWPOINT = {
 }
 _PATIENCE_S = 120.0  # kernels may have to be compiled first
 _WARM_S = 1.0
+_STALLED_AFTER_S = 60.0
+MAX_GROWTH_MB = 20.0
+"""More than this between the beginning and the end of a live scan, and memory is not flat."""
 
 
 @dataclass(frozen=True)
 class LiveFigures:
-    """A live scan of `seconds` by a camera of `size` px, with one viewer that draws and, from a third of the time on,
-    one that has stalled.
+    """A live scan of `seconds` by a camera of `size` px, with one viewer that draws and, after a third of the time or a
+    minute, one that has stalled.
 
     Captures a second before and after that; clouds a second decoded, reconstructed and sent to the viewer that draws;
     `latency_ms`: the median from the first frame's light until a cloud is sent, NaN where none was. `growth_mb`,
-    `growth_files`, `growth_threads`: how much more memory, open files and threads the program had in the last quarter
-    than in the second, None where the system does not report it.
+    `growth_files`, `growth_threads`: how much more memory, open files and threads the program had in the last tenth of
+    the time than in a tenth of it soon after the stalled viewer came, None where the system does not report it.
     """
 
     size: tuple[int, int]
@@ -76,7 +79,9 @@ class LiveFigures:
         """Return the figures as lines for the terminal."""
         growth = "memory unknown"
         if self.growth_mb is not None:
-            growth = f"memory {self.growth_mb:+.1f} MB, files {self.growth_files:+g}, threads {self.growth_threads:+g}"
+            flat = "yes" if self.growth_mb <= MAX_GROWTH_MB else "no"
+            growth = f"memory {self.growth_mb:+.1f} MB (flat within {MAX_GROWTH_MB:g} MB: {flat})"
+            growth += f", files {self.growth_files:+g}, threads {self.growth_threads:+g}"
         return (
             f"live at {self.size[0]}x{self.size[1]} for {self.seconds:.0f} s: {self.shown_per_s:.1f} clouds/s sent to "
             f"a viewer, {self.latency_ms:.0f} ms behind the light ({self.clouds_per_s:.1f}/s made of {self.points:,} "
@@ -110,11 +115,12 @@ def _measure(operator: Operator, server: SafeServer, seconds: float, progress: P
     begun, first = time.monotonic(), operator.live_captures
     used: list[tuple[float, tuple[float, ...]]] = []
     made, shown, behind, points = [], [], [], 0
+    alone = min(seconds / 3, _STALLED_AFTER_S)
     with contextlib.ExitStack() as stack:
         stalled: _Viewer | None = None
         halfway, then = 0.0, 0
         while (passed := time.monotonic() - begun) < seconds or stalled is None:
-            if stalled is None and passed > seconds / 3:
+            if stalled is None and passed > alone:
                 halfway, then = passed, operator.live_captures
                 stalled = stack.enter_context(_Viewer(server, draws=False))
             time.sleep(min(0.25, seconds / 20))
@@ -125,15 +131,17 @@ def _measure(operator: Operator, server: SafeServer, seconds: float, progress: P
             shown.append(live.shown_per_s)
             behind += [] if live.latency_ms is None else [live.latency_ms]
             points = live.points
-            used.append((passed / seconds, _measure_use()))
+            used.append((passed, _measure_use()))
             progress(min(passed / seconds, 0.999), f"live: {live.shown_per_s:.1f} clouds/s")
     captures = operator.live_captures
     camera = operator.snapshot().rig.camera
     assert camera is not None
     growth: list[float | None] = [None] * 3
-    quarter, last = ([use for share, use in used if low < share <= low + 0.25] for low in (0.25, 0.75))
-    if quarter and last and not np.isnan(used[0][1]).any():
-        growth = (np.median(last, axis=0) - np.median(quarter, axis=0)).tolist()
+    first_uses, last_uses = (
+        [use for at, use in used if low < at <= low + seconds / 10] for low in (1.5 * alone, 0.9 * seconds)
+    )
+    if first_uses and last_uses and not np.isnan(used[0][1]).any():
+        growth = (np.median(last_uses, axis=0) - np.median(first_uses, axis=0)).tolist()
     return LiveFigures(
         size=camera,
         seconds=seconds,
