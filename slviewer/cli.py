@@ -19,7 +19,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy is imported
 from slviewer import __version__, terminal
 from slviewer.commands.calibration import CALIBRATED, run_calibrate
 from slviewer.commands.command import JSON, read_command, show_result, union
-from slviewer.commands.devices import CHECKED, PORT, run_capture, run_preflight, run_turn
+from slviewer.commands.devices import CHECKED, PAGES, run_capture, run_preflight, run_turn
 from slviewer.commands.imports import make_import_command
 from slviewer.commands.meshing import MESHING, run_meshing
 from slviewer.commands.wizard import wizard
@@ -65,9 +65,9 @@ COMMANDS = Commands(
         "devices": partial(read_command, "pipeline.devices:devices"),
         "preflight": partial(read_command, "preflight.check_rig:check_rig", options=CHECKED, run=run_preflight),
         "capture": partial(
-            read_command, "pipeline.capture:capture", "session", "name", options=[PORT], run=run_capture
+            read_command, "pipeline.capture:capture", "session", "name", options=[*PAGES], run=run_capture
         ),
-        "turn": partial(read_command, "pipeline.turn:turn", "session", options=[PORT, JSON], run=run_turn),
+        "turn": partial(read_command, "pipeline.turn:turn", "session", options=[*PAGES, JSON], run=run_turn),
         "import": make_import_command,
         "calibrate": partial(
             read_command, "pipeline.calibrate:calibrate", "session", options=CALIBRATED, run=run_calibrate

@@ -6,7 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from playwright.sync_api import Browser, Error, Playwright
+from playwright.sync_api import Browser, BrowserType, Error
 
 _FLAGS = [
     "--no-sandbox",
@@ -22,12 +22,12 @@ _SYSTEM = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stabl
 _INSTALL = [sys.executable, "-m", "playwright", "install", "chromium"]
 
 
-def launched(playwright: Playwright) -> Browser:
+def launched(chromium: BrowserType, *flags: str) -> Browser:
     """The first Chromium that starts: the one that is asked for, the system's, Playwright's own, one fetched now."""
     asked = os.environ.get("SLVIEWER_CHROMIUM")
     if asked:
-        return playwright.chromium.launch(executable_path=asked, args=_FLAGS)
-    why = _tried(playwright)
+        return chromium.launch(executable_path=asked, args=[*_FLAGS, *flags])
+    why = _tried(chromium, flags)
     if isinstance(why, Browser):
         return why
     fetch = [_INSTALL]
@@ -35,7 +35,7 @@ def launched(playwright: Playwright) -> Browser:
         fetch += [["apt-get", "update"], ["apt-get", "install", "-y", "--no-install-recommends", "chromium"]]
     for command in fetch:
         subprocess.run(command, capture_output=True, timeout=600, check=False)
-        why = _tried(playwright)
+        why = _tried(chromium, flags)
         if isinstance(why, Browser):
             return why
     raise RuntimeError(
@@ -44,13 +44,13 @@ def launched(playwright: Playwright) -> Browser:
     )
 
 
-def _tried(playwright: Playwright) -> Browser | str:
+def _tried(chromium: BrowserType, flags: tuple[str, ...]) -> Browser | str:
     """A running browser, or why none runs."""
     why = "none was found"
-    for path in [*filter(None, map(shutil.which, _SYSTEM)), playwright.chromium.executable_path]:
+    for path in [*filter(None, map(shutil.which, _SYSTEM)), chromium.executable_path]:
         if Path(path).exists():
             try:
-                return playwright.chromium.launch(executable_path=path, args=_FLAGS)
+                return chromium.launch(executable_path=path, args=[*_FLAGS, *flags])
             except Error as error:
                 why = f"{path}: {error.message.splitlines()[0]}"
     return why

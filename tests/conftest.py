@@ -48,7 +48,7 @@ def disk_without_waits() -> Iterator[None]:
 def browser() -> Iterator[Browser]:
     """One for all tests: Playwright runs once in a process."""
     with sync_playwright() as playwright:
-        found = launched(playwright)
+        found = launched(playwright.chromium)
         yield found
         found.close()
 

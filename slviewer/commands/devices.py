@@ -1,4 +1,4 @@
-"""Rigs from the terminal: the projector page is served while a rig needs it."""
+"""Rigs from the terminal: the pages of a browser's devices are served while a rig needs them."""
 
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -10,12 +10,18 @@ from slviewer.commands.command import JSON, Option, call, show_result, write_jso
 from slviewer.errors import DeviceError, InputError, UsageError
 
 if TYPE_CHECKING:
-    from slviewer.devices.channel import Channel
+    from slviewer.devices.browser import PageChannels, PageRole
     from slviewer.pipeline.rig_choice import SetUp
+    from slviewer.server.secure import Serving
 
 PAGE_PATIENCE_S = 600.0
 """How long somebody may take to walk to the projector and open its page."""
-PORT = Option("port", int, 8080, "Port of the projector page, where the rig's projector is one; 0 takes any free one.")
+PAGES = (
+    Option("port", int, 8080, "Port of the pages, where projector or camera is one; 0 takes any free one."),
+    Option("host", str, "127.0.0.1", "Address to serve the pages at: 0.0.0.0 for other computers and phones."),
+    Option("tls", bool, False, "Encrypt the pages, as the browser of another device demands for its camera."),
+)
+"""How the pages of a rig's devices are served."""
 CHECKED = (
     Option(
         "rig", str | None, None, "A TOML file that describes the rig, or the name of one that `slviewer devices` lists."
@@ -26,7 +32,7 @@ CHECKED = (
         None,
         "Session folder and name of a recorded capture, to check its frames instead of a rig.",
     ),
-    PORT,
+    *PAGES,
     JSON,
 )
 """What `preflight` takes beside the parameters of `check_rig`."""
@@ -36,14 +42,14 @@ def run_capture(capture: Callable[..., Any], arguments: dict[str, Any]) -> None:
     """Capture, and print what the capture holds."""
     from slviewer.pipeline.inspect import summarise_capture
 
-    with _serve_projector_page(arguments.pop("port")) as set_up:
+    with _serve_pages(arguments) as set_up:
         saved = call(capture, set_up=set_up, say=terminal.print_result, **arguments)
     terminal.print_result(summarise_capture(saved))
 
 
 def run_turn(turn: Callable[..., Any], arguments: dict[str, Any]) -> None:
     """Scan all round, and show what was made."""
-    with _serve_projector_page(arguments.pop("port")) as set_up:
+    with _serve_pages(arguments) as set_up:
         show_result(turn, {**arguments, "set_up": set_up})
 
 
@@ -51,13 +57,13 @@ def run_preflight(check_rig: Callable[..., Any], arguments: dict[str, Any]) -> N
     """Check a rig, or a recorded capture where --capture names one, and raise an error where something is bad."""
     from slviewer.preflight.check_rig import check_capture
 
-    recorded, port, json_file = (arguments.pop(name) for name in ("capture", "port", "json"))
+    recorded, json_file = arguments.pop("capture"), arguments.pop("json")
     if (arguments["rig"] is None) == (recorded is None):
         raise UsageError("give --rig to check a rig, or --capture SESSION NAME to check the frames of a capture")
     if recorded is not None:
         checked = call(check_capture, session=recorded[0], capture=recorded[1])
     else:
-        with _serve_projector_page(port) as set_up:
+        with _serve_pages(arguments) as set_up:
             checked = call(check_rig, set_up=set_up, **arguments)
     write_json(json_file, checked.to_dict())
     terminal.print_result(checked.text())
@@ -68,40 +74,53 @@ def run_preflight(check_rig: Callable[..., Any], arguments: dict[str, Any]) -> N
 
 
 @contextmanager
-def _serve_projector_page(port: int) -> Iterator["SetUp"]:
-    """Yield the function that sets up rigs, which serves the projector page where needed until the block ends."""
-    from slviewer.devices.channel import Channel
-    from slviewer.pipeline.rig_choice import Board, Choice, RigSetup, needs_page, set_up
+def _serve_pages(arguments: dict[str, Any]) -> Iterator["SetUp"]:
+    """Take `PAGES` out of the arguments; yield the function that sets up rigs, which serves the pages that a rig needs
+    until the block ends."""
+    from slviewer.devices.browser import PageChannels
+    from slviewer.pipeline.rig_choice import Board, Choice, RigSetup, list_needed_pages, set_up
+    from slviewer.server.secure import Serving
 
+    serving = Serving(**{option.name: arguments.pop(option.name) for option in PAGES})
     with ExitStack() as ended:
 
         def make(choice: Choice, board: Board | None) -> RigSetup:
-            """Set up a rig, with a channel to the projector page where it needs one."""
-            if not needs_page(choice):
+            """Set up a rig, with channels to the pages that it needs."""
+            needed = list_needed_pages(choice)
+            if not needed:
                 return set_up(choice, board)
-            # with an assumed size and without a page, so that what is impossible is refused before somebody walks there
-            projector = {"size": [912, 1140], **choice["projector"]}
-            set_up({**choice, "projector": projector}, board, channel=Channel())
-            return set_up(choice, board, channel=_connect_page(port, ended))
+            # with assumed sizes and without pages, so that what is impossible is refused before somebody walks there
+            devices: dict[str, Any] = {role: {"size": [912, 1140], **choice[role]} for role in needed}
+            set_up({**choice, **devices}, board, pages=PageChannels())
+            return set_up(choice, board, pages=_connect_pages(serving, needed, ended))
 
         yield make
 
 
-def _connect_page(port: int, ended: ExitStack) -> "Channel":
-    """Serve the projector page and return the channel to it, once it is ready. Raises DeviceError on timeout."""
-    from slviewer.devices.channel import Channel
-    from slviewer.server.projector_page import serve_projector
-    from slviewer.server.secure import Serving, serve
+def _connect_pages(serving: "Serving", needed: tuple["PageRole", ...], ended: ExitStack) -> "PageChannels":
+    """Serve the pages and return the channels to them, once those needed are ready. Raises DeviceError on timeout."""
+    from slviewer.devices.browser import PageChannels
+    from slviewer.server.device_pages import serve_device_pages
+    from slviewer.server.secure import serve
 
-    channel, server = Channel(), serve(Serving(port=port), label="slviewer")
+    pages, server = PageChannels(), serve(serving, label="slviewer")
     ended.callback(server.stop)
-    serve_projector(server, channel)
-    terminal.print_message(f"Open this on the projector's screen, full screen: {server.link('project')}")
-    reported = ""
+    serve_device_pages(server, pages)
+    if server.certificate is not None and server.certificate.self_made:
+        terminal.print_message(f"Fingerprint of the pages' certificate (SHA-256): {server.certificate.fingerprint}")
+    if "projector" in needed:
+        terminal.print_message(f"Open this on the projector's screen, full screen: {server.link('project')}")
+    if "camera" in needed:
+        terminal.print_message(f"Open this on the phone or laptop that is the camera: {server.link('camera')}")
+    reported = dict.fromkeys(needed, "")
     for _ in range(int(PAGE_PATIENCE_S)):
-        standing = channel.wait_ready(1.0)
-        if standing.state == "ready":
-            return channel
-        if standing.words != reported:
-            terminal.print_message(f"projector page: {(reported := standing.words)}")
-    raise DeviceError(f"the projector page was not ready within {PAGE_PATIENCE_S:g} s: {channel.page_state().words}")
+        states = {role: getattr(pages, role).page_state() for role in needed}
+        if all(state.state == "ready" for state in states.values()):
+            return pages
+        for role, state in states.items():
+            if state.words != reported[role]:
+                reported[role] = state.words
+                terminal.print_message(f"{role} page: {state.words}")
+        getattr(pages, next(role for role in needed if states[role].state != "ready")).wait_ready(1.0)
+    reasons = "; ".join(f"the {role} page: {state.words}" for role, state in states.items() if state.state != "ready")
+    raise DeviceError(f"not ready within {PAGE_PATIENCE_S:g} s: {reasons}")

@@ -1,121 +1,30 @@
-"""A projector that any computer has: a page, full screen on the projector's output, that shows patterns pixel by pixel.
+"""Devices that any computer or phone has: a screen as the projector, a camera, each through a page in a browser."""
 
-A pattern varies along one axis, so that its profile alone is sent; the page keeps the profiles of one sequence, and
-repeats one over its canvas when it is shown. "Shown" is reported two animation frames later: the picture is composited
-by then, not yet emitted, and what the display adds is measured and waited for as the rig's `settle_ms`.
-"""
+from dataclasses import dataclass, field
+from typing import Literal, get_args
 
-from collections.abc import Sequence
-
-from slviewer.devices.channel import Channel, PageConnection
+from slviewer.devices.browser_camera import BrowserCamera, CameraChannel
+from slviewer.devices.browser_projector import ProjectorChannel, browser_projector
 from slviewer.devices.drivers import Driver
-from slviewer.devices.opening import Openable
-from slviewer.devices.protocols import check_index, check_level, check_sequence
-from slviewer.errors import DeviceError, InputError
-from slviewer.fringe.patterns import profile
-from slviewer.fringe.sequence import PatternSequence
 
-_MAX_SIZE_PX = 16384
+PageRole = Literal["projector", "camera"]
+"""The devices that may be pages in a browser."""
+PAGE_ROLES: tuple[PageRole, ...] = get_args(PageRole)
 
 
-class BrowserProjector(Openable):
-    """A projector of `size` (width, height) px that shows its patterns on the page connected to `channel`.
+@dataclass(frozen=True)
+class PageChannels:
+    """The channels to the pages of the browser's devices."""
 
-    A capture that loses its page, or during which the page's window changes, ends with a DeviceError; `load` then sends
-    the patterns again, to whatever page is ready by then.
-    """
-
-    def __init__(self, channel: Channel, size: tuple[int, int]) -> None:
-        super().__init__("the browser projector")
-        self.size = size
-        self._channel = channel
-        self._sequence: PatternSequence | None = None
-        self._sent: tuple[list[str], bytes] | None = None
-        self._page: PageConnection | None = None  # that has what was sent
-        self._changes = 0
-
-    def open(self) -> None:
-        """Show dark. Raises DeviceError with a remedy where the page cannot show patterns pixel by pixel."""
-        super().open()
-        try:
-            self._forget_loaded()
-            self._channel.set_pattern_size(self.size)
-            self._channel.page()
-            self.show_level(None)
-        except BaseException:
-            self.close()
-            raise
-
-    def close(self) -> None:
-        """Release the page, which then shows its marker."""
-        if self._open:
-            self._channel.set_light(None)
-        self._forget_loaded()
-        super().close()
-
-    def load(self, sequence: PatternSequence) -> None:
-        """Send all patterns of the sequence, unless the page has them already. Raises InputError or DeviceError."""
-        self.check_open()
-        check_sequence(self, sequence)
-        page = self._channel.page()
-        profiles = [profile(sequence, k) for k in range(len(sequence.frames))]
-        axes: list[str] = [axis or "x" for axis, _ in profiles]
-        sent = axes, b"".join(levels.tobytes() for _, levels in profiles)
-        if page is not self._page or sent != self._sent:
-            self._forget_loaded()
-            page.request("load", sent[1], size=self.size, axes=axes)
-        self._sequence, self._sent, self._page, self._changes = sequence, sent, page, page.changes
-
-    def show(self, index: int) -> None:
-        """Show frame `index`. Raises DeviceError where the page or its size changed since the patterns were sent."""
-        self.check_open()
-        check_index(self, self._sequence, index)
-        page = self._page
-        try:
-            assert page is not None
-            page.request("show", index=index)
-            if page.changes != self._changes:
-                raise DeviceError("the projector page's window changed while patterns were shown: capture again")
-        except BaseException:
-            self._forget_loaded()
-            raise
-
-    def show_level(self, grey: int | None) -> None:
-        """Show even light; a reloaded page shows it again."""
-        self.check_open()
-        level = check_level(grey)
-        page = self._channel.page()
-        self._channel.set_light(level)
-        page.request("level", grey=level)
-
-    def _forget_loaded(self) -> None:
-        """Forget the loaded sequence and the page that it was sent to."""
-        self._sequence = self._sent = self._page = None
-
-
-def browser_projector(size: Sequence[int] | None = None, channel: Channel | None = None) -> BrowserProjector:
-    """Create a projector of `size` (width, height) px, by default the size of the connected page's screen.
-
-    Raises DeviceError without a channel, and where `size` is None and no page is connected.
-    """
-    if channel is None:
-        raise DeviceError(
-            "the browser projector's page is served by `slviewer wizard` and `slviewer capture`: use one of them"
-        )
-    if size is None:
-        page_size = channel.page_state().size
-        if page_size is None:
-            raise DeviceError("the projector's size is unknown: open the projector page first, or give the size")
-        return BrowserProjector(channel, page_size)
-    if len(size) != 2 or not all(isinstance(side, int) and 0 < side <= _MAX_SIZE_PX for side in size):
-        raise InputError(f"{size!r} is not a projector size: give its width and height in px, such as [1920, 1080]")
-    return BrowserProjector(channel, (size[0], size[1]))
+    projector: ProjectorChannel = field(default_factory=ProjectorChannel)
+    camera: CameraChannel = field(default_factory=CameraChannel)
 
 
 DRIVER = Driver(
     "browser",
-    "a page, full screen on the projector's output",
-    needs="the projector page, open in a browser on the projector's screen",
+    "a page on a screen, phone or laptop",
+    needs="the projector page, open in a browser on the projector's screen; the camera page, on the phone or laptop",
+    camera=BrowserCamera,
     projector=browser_projector,
-    channel=True,
+    page=True,
 )

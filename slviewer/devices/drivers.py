@@ -18,8 +18,8 @@ class Driver:
 
     `what`: in a few words, what it drives. `packages`: how to install each package that must be importable, such as
     ``{"harvesters": "pip install 'slviewer[genicam]'"}``. A driver offers cameras, projectors, turntables, whole rigs
-    (where both devices share something), or several of these. `channel`: its factories also take the keyword `channel`,
-    the wire to the projector page. `list_connected` returns a line per connected device.
+    (where both devices share something), or several of these. `page`: camera and projector are pages in a browser, and
+    take the keyword `page`, the channel to it. `list_connected` returns a line per connected device.
     """
 
     name: str
@@ -30,7 +30,7 @@ class Driver:
     projector: Callable[..., Projector] | None = None
     rig: Callable[..., Rig] | None = None
     turntable: Callable[..., Turntable] | None = None
-    channel: bool = False
+    page: bool = False
     list_connected: Callable[[], Sequence[str]] | None = None
 
     @property

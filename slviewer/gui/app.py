@@ -16,7 +16,8 @@ from typing import Any
 
 import viser
 
-from slviewer.devices.channel import Channel, PageState
+from slviewer.devices.browser import PAGE_ROLES, PageChannels, PageRole
+from slviewer.devices.page_channel import PageState
 from slviewer.errors import SlviewerError, UsageError
 from slviewer.gui.links import show_links
 from slviewer.gui.panel import PanelContext
@@ -26,8 +27,8 @@ from slviewer.gui.viewpoints import FIELD_OF_VIEW, OVERVIEW, Viewpoints
 from slviewer.pipeline.rig_choice import set_up
 from slviewer.pipeline.rig_presets import load_rig
 from slviewer.server import viser_internals
-from slviewer.server.access import ONE_TIME_SECONDS
-from slviewer.server.projector_page import serve_projector
+from slviewer.server.access import ONE_TIME_SECONDS, ROLES
+from slviewer.server.device_pages import serve_device_pages
 from slviewer.server.secure import SafeServer, Serving, serve
 from slviewer.server.viewers import Viewers
 from slviewer.session.store import Session
@@ -51,20 +52,20 @@ class App:
         operator: Operator,
         serving: Serving,
         *,
-        channel: Channel | None = None,
+        pages: PageChannels | None = None,
         print_links: Callable[[SafeServer], None] = lambda _: None,
     ) -> None:
-        """Serve `operator`, and the projector page if `channel` is given, the one that its rigs are set up with.
+        """Serve `operator`, and the pages of devices if `pages` is given, those that its rigs are set up with.
 
         `print_links` is called when the links were replaced. Raises SlviewerError where it cannot be served.
         """
         self.operator = operator
-        self.channel = channel
+        self.pages = pages
         self._print_links = print_links
         self.server: SafeServer = serve(serving, label="slviewer")
         try:
-            if channel is not None:
-                serve_projector(self.server, channel)
+            if pages is not None:
+                serve_device_pages(self.server, pages)
             self._start()
         except BaseException:
             self.server.stop()
@@ -118,14 +119,15 @@ class App:
 
     def _draw_forever(self) -> None:
         """Draw new snapshots and previews until closing; a failure is reported once and retried every second."""
-        version, number, page = -1, -1, None
+        version, number = -1, -1
+        pages: list[PageState | None] = []
         while not self._closing:
             begun = time.monotonic()
             self._changed.wait(0.5)
             self._changed.clear()
             if self._closing:
                 return
-            if page != (page := self._get_page_state()):
+            if pages != (pages := [self._get_page_state(role) for role in PAGE_ROLES]):
                 version = -1
             try:
                 version, number = self._draw(version, number)
@@ -181,9 +183,11 @@ class App:
             self._offers[path] = self.server.downloads.offer(path, within=folder)
         return self._offers[path]
 
-    def _get_page_state(self) -> PageState | None:
-        """Return the state of the projector page; None where none is served."""
-        return None if self.channel is None else self.channel.page_state()
+    def _get_page_state(self, role: PageRole) -> PageState | None:
+        """Return the state of a device's page; None where none is served."""
+        if self.pages is None:
+            return None
+        return (self.pages.projector if role == "projector" else self.pages.camera).page_state()
 
     def _greet_client(self, client: viser.ClientHandle) -> None:
         """Show a browser that may only watch that it may, and an operator's what only operators see."""
@@ -225,14 +229,14 @@ def run(
 
     Raises SlviewerError where the session, the rig or the address cannot be used.
     """
-    channel = Channel()
-    with Operator(set_up=partial(set_up, channel=channel)) as operator:
+    pages = PageChannels()
+    with Operator(set_up=partial(set_up, pages=pages)) as operator:
         _check_granted(operator, operator.open_session(session or Path(DEFAULT_SESSION)))
         store = operator.session
         remembered = store is not None and (store.valid_decision("rig") or store.decision_faults())
         if rig or not remembered:  # a remembered rig that is not connected now is not replaced by the simulated one
             _check_granted(operator, operator.choose_rig(rig_choice(rig or "simulated", operator.session)))
-        app = App(operator, serving or Serving(), channel=channel, print_links=print_links)
+        app = App(operator, serving or Serving(), pages=pages, print_links=print_links)
         preparation = Preparation(operator.set_preparing)
         preparation.start()
         with contextlib.ExitStack() as ended:
@@ -254,8 +258,9 @@ def print_links(server: SafeServer) -> None:
         print(f"slviewer is ready: {server.link()}")
         print(f"view-only link:    {server.link('watch')}")
         print(f"projector page:    {server.link('project')}")
+        print(f"camera page:       {server.link('camera')}")
     else:
-        print(f"slviewer is ready: {server.origin}/#TOKEN, with the tokens operate, watch and project of {file}")
+        print(f"slviewer is ready: {server.origin}/#TOKEN, with the tokens {', '.join(ROLES)} of {file}")
     if server.certificate is None and not server.loopback:
         print("The connection is not encrypted: use --tls, or a network that you trust.")
     elif server.certificate is not None and server.certificate.self_made:

@@ -1,29 +1,46 @@
-"""The links for other people and screens, shown to the operator's browser that requests them and to no other."""
+"""The links for other people and devices, shown to the operator's browser that requests them and to no other."""
 
+import base64
 import html
 from collections.abc import Callable
+from urllib.parse import urlsplit
 
+import cv2
 import viser
 
-from slviewer.gui.widgets import Html, paragraph, to_html
+from slviewer.gui.widgets import Html, alert, paragraph, to_html
 from slviewer.server.secure import SafeServer
+
+_QUIET_ZONE = 4
+"""White modules around a QR code (ISO/IEC 18004)."""
 
 
 def show_links(client: viser.ClientHandle, server: SafeServer, replace: Callable[[], None]) -> None:
     """Open a dialog with the links in one browser; `replace()` is called when new ones are requested in it."""
     origin = server.origin_of(client.client_id)
+    is_own = origin is not None and urlsplit(origin).hostname in ("127.0.0.1", "localhost", "::1")
+    if is_own and not server.loopback:
+        origin = server.shared_origin
+    others_reach = not (is_own and server.loopback)
     rows = [("To watch, from any computer that reaches this address", server.link("watch", origin))]
-    if server.projector.handler is not None:
+    if server.device_pages:
         rows.append(("Projector page, on another computer", server.link("project", origin)))
+        link = server.link("camera", origin)
+        needs = "" if link.startswith("https:") else ", whose browsers demand --tls"
+        rows.append((f"Camera page, on a phone or another computer{needs}", link))
     with client.gui.add_modal("Links") as dialog:
         gui = client.gui
-        gui.add_html("".join(_link_html(what, link) for what, link in rows))
+        gui.add_html("".join(_link_html(what, link, others_reach) for what, link in rows))
+        if not others_reach:
+            advice = "Only this computer reaches these links. For others, and phones, start slviewer with"
+            code = "<code style='white-space:nowrap'>--host 0.0.0.0 --tls</code>"
+            gui.add_html(str(alert(Html(f"{advice} {code}."), "info")))
         gui.add_html(
             str(
                 paragraph(
                     Html(
-                        "<b>New links</b> closes every page that was opened by the present ones, for watching and of "
-                        "the projector too. This page continues."
+                        "<b>New links</b> closes every page that was opened by the present ones, those of projector "
+                        "and camera too. This page continues."
                     )
                 )
             )
@@ -34,10 +51,23 @@ def show_links(client: viser.ClientHandle, server: SafeServer, replace: Callable
     close.on_click(lambda _: dialog.close())
 
 
-def _link_html(what: str, link: str) -> Html:
-    """Return the HTML of one link, selected by a click to be copied."""
+def _link_html(what: str, link: str, qr_code: bool) -> Html:
+    """Return the HTML of one link, selected by a click to be copied, and its QR code for a phone."""
     style = (
         "display:block;user-select:all;overflow-wrap:anywhere;padding:0.4em 0.6em;border-radius:4px;"
-        "background:var(--mantine-color-gray-1);font-family:monospace;font-size:0.9em"
+        "background:var(--mantine-color-gray-1);font-family:monospace;font-size:0.9em;flex:1"
     )
-    return paragraph(Html(f"{to_html(what)}:<code style='{style}'>{html.escape(link)}</code>"))
+    code = f"<code style='{style}'>{html.escape(link)}</code>"
+    if qr_code:
+        look = "width:7.5em;height:7.5em;image-rendering:pixelated;background:#fff"
+        code += f"<img alt='QR code of this link' style='{look}' src='{encode_qr_code(link)}'>"
+    row = "display:flex;gap:0.6em;align-items:center;margin-top:0.2em"
+    return paragraph(Html(f"{to_html(what)}:<span style='{row}'>{code}</span>"))
+
+
+def encode_qr_code(text: str) -> str:
+    """Return the QR code of a text as the address of a PNG picture, a pixel a module."""
+    modules = cv2.QRCodeEncoder.create().encode(text)
+    border = max(0, _QUIET_ZONE - int((modules == 0).any(axis=0).argmax()))  # OpenCV adds some of it
+    modules = cv2.copyMakeBorder(modules, *(border,) * 4, cv2.BORDER_CONSTANT, value=255)
+    return f"data:image/png;base64,{base64.b64encode(cv2.imencode('.png', modules)[1].tobytes()).decode()}"

@@ -11,7 +11,8 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 import viser
 
-from slviewer.devices.channel import PageState
+from slviewer.devices.browser import PageRole
+from slviewer.devices.page_channel import PageState
 from slviewer.errors import InputError
 from slviewer.gui.pictures import Painter
 from slviewer.gui.scene import ViewerScene
@@ -31,7 +32,7 @@ class PanelContext:
     `gui` builds inputs, `scene` draws in 3D, `viewpoints` moves the browsers' views, `operator` takes requests.
     `offer(path)` returns the address at which a file of the session is downloaded; `notify(level, text)` shows a
     notification in every browser; `go(key)` shows another step. `executor` runs one callback after the other.
-    `projector_page()` returns the state of the projector page; None where none is served. `viewers(answered)` tracks
+    `page_state(role)` returns the state of a device's page; None where none is served. `viewers(answered)` tracks
     which browsers have drawn what they were sent. `show_links(client)` shows the links in one browser.
     """
 
@@ -45,7 +46,7 @@ class PanelContext:
     failed: Callable[[BaseException], None]
     executor: Executor
     viewers: Callable[[Callable[[], None]], Viewers]
-    projector_page: Callable[[], PageState | None] = lambda: None
+    page_state: Callable[[PageRole], PageState | None] = lambda _: None
     show_links: Callable[[viser.ClientHandle | None], None] = lambda _: None
 
     @property

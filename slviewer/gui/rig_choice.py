@@ -5,7 +5,9 @@ from typing import Any
 
 import viser
 
+from slviewer.devices.browser import PAGE_ROLES, PageRole
 from slviewer.devices.drivers import Driver, available
+from slviewer.devices.page_channel import PageState
 from slviewer.errors import InputError
 from slviewer.gui.inputs import SessionValue, change
 from slviewer.gui.panel import PanelContext
@@ -57,7 +59,7 @@ class RigChoice:
                 viser.Icon.PLUG_CONNECTED,
                 None,
             )
-        self._page = Text(gui)
+        self._pages = {role: Text(gui) for role in PAGE_ROLES}
         with gui.add_folder("Recording", visible=False) as self._recording:
             self._folder = gui.add_text(
                 "Source folder", "", hint="A session, or folders of images that can be imported"
@@ -71,7 +73,7 @@ class RigChoice:
         with gui.add_folder("Save this rig", visible=False, expand_by_default=False) as self._saving:
             self._name = gui.add_text("Name", "", hint="The rig is then offered by this name, with its exposure")
             context.button("Save", lambda: context.operator.save_rig(self._name.value), viser.Icon.DEVICE_FLOPPY)
-        self._needs_page = False
+        self._needed_pages: tuple[PageRole, ...] = ()
         self._draw_devices()
         self._offer_rigs()
 
@@ -88,8 +90,8 @@ class RigChoice:
         change(self._retry, visible=rig.state == "lost")
         self._draw_folders()
         change(self._saving, visible=rig.state == "open" and not rig.simulated)
-        self._needs_page = rig.needs_page
-        self._draw_page()
+        self._needed_pages = rig.pages
+        self._draw_pages()
 
     def _offer_rigs(self) -> None:
         """Update the options from the rig presets; a choice that is no longer offered is reset."""
@@ -140,12 +142,15 @@ class RigChoice:
         """Show the inputs for custom devices or a recording, as chosen."""
         change(self._devices, visible=self._choice.value == _CUSTOM)
         change(self._recording, visible=self._choice.value == _REPLAY)
-        self._draw_page()
+        self._draw_pages()
 
-    def _draw_page(self) -> None:
-        """Show the state of the projector page where the rig needs it."""
-        own = self._choice.value == _CUSTOM and self._projectors[self._projector.value].channel
-        self._page.set(_page_html(self._context.projector_page()) if self._needs_page or own else "")
+    def _draw_pages(self) -> None:
+        """Show the states of the pages that the rig needs, or the devices that are being chosen."""
+        own = {"camera": self._cameras[self._camera.value], "projector": self._projectors[self._projector.value]}
+        for role, text in self._pages.items():
+            is_chosen = self._choice.value == _CUSTOM and own[role].page
+            needed = is_chosen or role in self._needed_pages
+            text.set(_page_html(role, self._context.page_state(role)) if needed else "")
 
     def _draw_devices(self) -> None:
         """Show what the chosen drivers lack, and whether the camera needs an identifier."""
@@ -154,7 +159,7 @@ class RigChoice:
         self._missing.write(missing, "warning")
         change(self._use, disabled=bool(missing))
         change(self._source, visible=_address_option(chosen[0]) is not None)
-        self._draw_page()
+        self._draw_pages()
 
     def _read_entered(self) -> Choice:
         """Return the rig of the entered devices. Raises InputError for an invalid one."""
@@ -163,8 +168,11 @@ class RigChoice:
         option, address = _address_option(camera), self._source.value.strip()
         if option is not None and address:
             camera_choice[option] = int(address) if address.isdecimal() and option == "source" else address
+        video = self._context.page_state("camera") if camera.page else None
+        if video is not None and video.size is not None:  # saved, as the projector's
+            camera_choice["size"] = list(video.size)
         projector_choice: dict[str, Any] = {"driver": projector.name}
-        page = self._context.projector_page() if projector.channel else None
+        page = self._context.page_state("projector") if projector.page else None
         if self._size.value.strip():
             projector_choice["size"] = _size(self._size.value)
         elif page is not None and page.size is not None:  # saved, since the page may be opened after the session
@@ -216,11 +224,18 @@ def _rig_html(rig: RigView) -> str:
     return html + "".join(alert(note, "warning") for note in rig.notes)
 
 
-def _page_html(standing: Any) -> str:
-    """Describe the state of the projector page, and how to open it; viewers read this too, and may not."""
+_PAGE_USE: dict[PageRole, str] = {
+    "projector": "and move its window to the projector's screen; on another computer, open the link that Links shows.",
+    "camera": "where this computer's camera is used; on a phone, open the link that Links shows, which needs "
+    "<code style='white-space:nowrap'>slviewer --tls --host 0.0.0.0</code>.",
+}
+
+
+def _page_html(role: PageRole, standing: PageState | None) -> str:
+    """Describe the state of a device's page, and how to open it; viewers read this too, and may not."""
     if standing is None:
-        return alert("This rig needs the projector page, which is not served here.", "error")
-    link = '<a href="projector" target="_blank" rel="noopener">Open the projector page</a>'
-    how = f"{link} and move its window to the projector's screen; on another computer, open the link that Links shows."
+        return alert(f"This rig needs the {role} page, which is not served here.", "error")
+    how = f'<a href="{role}" target="_blank" rel="noopener">Open the {role} page</a> {_PAGE_USE[role]}'
     tone: Tone = {"waiting": "info", "refused": "warning", "ready": "good"}[standing.state]  # type: ignore[assignment]
-    return alert(Html(f"Projector page: {to_html(standing.words)}" + ("" if tone == "good" else f"<br>{how}")), tone)
+    words = f"{role.capitalize()} page: {to_html(standing.words)}"
+    return alert(Html(words if tone == "good" else f"{words}<br>{how}"), tone)

@@ -111,9 +111,7 @@ def load_judged(store: Session, name: str, board: Board, smoothing: Smoothing) -
         settings = (meta["target"], meta["smoothing"], meta.get("reading"))
         if settings != (str(board), _list_settings(smoothing), READING_VERSION):
             return None
-        if meta["refused"]:
-            return Judged(name, None, meta["refused"])
-        return Judged(name, Observation.from_arrays(name, arrays))
+        return Judged(name, _decode_observation(name, meta, arrays), meta["refused"])
 
     return store.decode_fresh(f"poses/{name}", decode)
 
@@ -164,10 +162,14 @@ def load_observations(store: Session, names: Sequence[str]) -> list[Observation]
     observations = []
     for name in names:
         if store.has_result(f"poses/{name}"):
-            meta, arrays = store.load_result(f"poses/{name}")
-            if not meta["refused"]:
-                observations.append(Observation.from_arrays(name, arrays))
+            observation = store.decode_result(f"poses/{name}", partial(_decode_observation, name))
+            observations += [] if observation is None else [observation]
     return observations
+
+
+def _decode_observation(name: str, meta: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> Observation | None:
+    """Return the observation in a stored reading; None where the pose was refused."""
+    return None if meta["refused"] else Observation.from_arrays(name, arrays)
 
 
 def _list_settings(smoothing: Smoothing) -> list[str | int]:

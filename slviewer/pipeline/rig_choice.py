@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
-from slviewer.devices.channel import Channel
+from slviewer.devices.browser import PAGE_ROLES, PageChannels, PageRole
 from slviewer.devices.drivers import Driver, driver, drivers
 from slviewer.devices.protocols import Rig, Turntable
 from slviewer.devices.simulated import simulated_rig
@@ -40,13 +40,13 @@ class RigSetup:
 SetUp = Callable[[Choice, Board | None], RigSetup]
 
 
-def set_up(choice: Choice, board: Board | None, *, channel: Channel | None = None) -> RigSetup:
-    """The devices of a choice, not opened yet; `board` is in front of a simulated rig, `channel` leads to the
-    projector page where one is served.
+def set_up(choice: Choice, board: Board | None, *, pages: PageChannels | None = None) -> RigSetup:
+    """The devices of a choice, not opened yet; `board` is in front of a simulated rig, `pages` leads to the pages of
+    the browser's devices where they are served.
 
     Raises InputError for an invalid choice, DeviceError for a driver that cannot be used here.
     """
-    bench = _set_up_devices(choice, board, channel)
+    bench = _set_up_devices(choice, board, pages)
     if "turntable" not in choice:
         return bench
     return replace(bench, rig=replace(bench.rig, turntable=_set_up_turntable(choice["turntable"], bench.world)))
@@ -68,7 +68,7 @@ def _set_up_turntable(choice: Choice, world: SimulatedWorld | None) -> Turntable
         raise InputError(f"the turntable {dict(choice)} cannot be set up ({error}): choose it again") from error
 
 
-def _set_up_devices(choice: Choice, board: Board | None, channel: Channel | None) -> RigSetup:
+def _set_up_devices(choice: Choice, board: Board | None, pages: PageChannels | None) -> RigSetup:
     """Camera and projector of a choice, as `set_up` returns them."""
     options = {key: value for key, value in choice.items() if key not in (*COMMON_KEYS, "driver")}
     focal, settle_ms = choice.get("focal_px"), float(choice.get("settle_ms", 0.0))
@@ -83,7 +83,7 @@ def _set_up_devices(choice: Choice, board: Board | None, channel: Channel | None
             chosen = driver(str(choice["driver"]))
             if chosen.rig is None:
                 raise InputError(f"the driver {choice['driver']} offers no whole rig: choose a camera and a projector")
-            rig = chosen.rig(**options, **_channel_option(chosen, channel))
+            rig = chosen.rig(**options)
             return RigSetup(replace(rig, settle_ms=settle_ms or rig.settle_ms), focal_px=focal)
         camera, projector = (dict(options.pop(which)) for which in ("camera", "projector"))
         eye, lamp = driver(camera.pop("driver")), driver(projector.pop("driver"))
@@ -91,8 +91,8 @@ def _set_up_devices(choice: Choice, board: Board | None, channel: Channel | None
             raise InputError("one of the drivers offers no such device: choose others")
         rig = Rig(
             str(choice.get("name", "rig")),
-            eye.camera(**camera, **_channel_option(eye, channel)),
-            lamp.projector(**projector, **_channel_option(lamp, channel)),
+            eye.camera(**camera, **({"page": pages and pages.camera} if eye.page else {})),
+            lamp.projector(**projector, **({"page": pages and pages.projector} if lamp.page else {})),
             settle_ms,
         )
         return RigSetup(rig, focal_px=focal)
@@ -100,21 +100,17 @@ def _set_up_devices(choice: Choice, board: Board | None, channel: Channel | None
         raise InputError(f"the rig {dict(choice)} cannot be set up ({error}): choose it again") from error
 
 
-def needs_page(choice: Choice) -> bool:
-    """Return whether one of a choice's devices is reached through the projector page."""
-    parts = [choice, *(part for key in ("camera", "projector") if isinstance(part := choice.get(key), Mapping))]
-    return any(drivers()[str(part["driver"])].channel for part in parts if str(part.get("driver")) in drivers())
+def list_needed_pages(choice: Choice) -> tuple[PageRole, ...]:
+    """Return which of a choice's devices are pages in a browser."""
+    parts = {role: choice.get(role) for role in PAGE_ROLES}
+    names = {role: str(part.get("driver")) for role, part in parts.items() if isinstance(part, Mapping)}
+    return tuple(role for role, name in names.items() if name in drivers() and drivers()[name].page)
 
 
 def rig_factory(driver: Driver) -> Callable[..., Any] | None:
     """Return the function that builds the whole rig of a driver from its options; None if it drives no whole rig."""
     own: dict[str, Callable[..., Any]] = {"simulated": _simulated_setup, "replay": reel}
     return own.get(driver.name, driver.rig)
-
-
-def _channel_option(driver: Driver, channel: Channel | None) -> dict[str, Channel | None]:
-    """The keyword argument ``channel`` for a driver that needs one."""
-    return {"channel": channel} if driver.channel else {}
 
 
 def _simulated_setup(board: Board | None, preset: str = "letter", scale: float = 1.0, seed: int = 0) -> RigSetup:

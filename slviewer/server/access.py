@@ -21,8 +21,8 @@ from websockets.datastructures import Headers
 
 from slviewer.errors import UsageError
 
-Role = Literal["operate", "watch", "project"]
-"""Who may do what: operate the wizard, watch it, or be the projector page."""
+Role = Literal["operate", "watch", "project", "camera"]
+"""Who may do what: operate the wizard, watch it, or be the page of the projector or of the camera."""
 ROLES: tuple[Role, ...] = get_args(Role)
 
 ONE_TIME_SECONDS = 120.0

@@ -3,7 +3,7 @@
 import json
 import logging
 import re
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass
 from http import HTTPStatus
 from importlib import resources
@@ -11,7 +11,7 @@ from importlib import resources
 from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 
-from slviewer.server.access import Access, Grant, Refusal
+from slviewer.server.access import Access, Grant, Refusal, Role
 from slviewer.server.connection import Connection
 from slviewer.server.downloads import PREFIX, Downloads
 from slviewer.server.limits import Admissions, address_group
@@ -20,18 +20,18 @@ from slviewer.server.responses import harden, page_policy, respond, viser_policy
 logger = logging.getLogger("slviewer.server")
 
 LOGIN = "/login"
-PROJECTOR = "projector"
-"""Below the operator's path: leads to the projector page with the rights of that page alone."""
+DEVICE_PATHS: dict[str, Role] = {"projector": "project", "camera": "camera"}
+"""Below the operator's path: they lead to the page of a device with the rights of that page alone."""
 _HTML = "text/html; charset=utf-8"
 _PATH = re.compile(r"/|(/[A-Za-z0-9_-][A-Za-z0-9._-]*)+/?")
 
 
-@dataclass
-class ProjectorPage:
-    """The projector page, where one is served, and the handler of the WebSockets that it opens."""
+@dataclass(frozen=True)
+class DevicePage:
+    """The page of a device, and the handler of the WebSockets that it opens."""
 
-    html: bytes = b""
-    handler: Callable[[ServerConnection], Awaitable[None]] | None = None
+    html: bytes
+    handler: Callable[[ServerConnection], Awaitable[None]]
 
 
 class AuthMiddleware:
@@ -41,20 +41,20 @@ class AuthMiddleware:
         self,
         access: Access,
         admissions: Admissions,
-        projector: ProjectorPage,
+        device_pages: Mapping[Role, DevicePage],
         downloads: Downloads,
         page: bytes,
         scripts: tuple[str, ...],
         subprotocol: str,
         strict_transport: bool = False,
     ) -> None:
-        """`page` is viser's, `scripts` the hashes of those that it may run, `subprotocol` that of its WebSocket.
-
-        `strict_transport`: browsers are told to use this host encrypted from now on.
+        """`device_pages`: those that are served, which may change; `page` is viser's, `scripts` the hashes of those
+        that it may run, `subprotocol` that of its WebSocket. `strict_transport`: browsers are told to use this host
+        encrypted from now on.
         """
         self._access = access
         self._admissions = admissions
-        self._projector = projector
+        self._device_pages = device_pages
         self._downloads = downloads
         self._viser_page = page
         self._scripts = scripts
@@ -101,23 +101,25 @@ class AuthMiddleware:
             return None
         if rest == "favicon.ico":  # asked for by the page of "/" too, which so learns whether its cookie is valid
             return self._empty()
-        if grant.role == "project":
-            if rest or self._projector.handler is None:
-                raise Refusal(HTTPStatus.NOT_FOUND, "There is no projector page here.")
-            return self._page(self._projector.html, page_policy(self._projector.html, host))
+        if grant.role in DEVICE_PATHS.values():
+            if rest or grant.role not in self._device_pages:
+                raise Refusal(HTTPStatus.NOT_FOUND, "There is no such page here.")
+            html = self._device_pages[grant.role].html
+            return self._page(html, page_policy(html, host))
         if not rest:
             return self._page(self._viser_page, viser_policy(self._scripts, host))
         if rest.startswith(PREFIX):
             return await self._download(connection, rest)
-        if rest == PROJECTOR and grant.role == "operate" and self._projector.handler is not None:
-            return self._lead_to(access.grants["project"], request)
+        if grant.role == "operate" and DEVICE_PATHS.get(rest) in self._device_pages:
+            return self._lead_to(access.grants[DEVICE_PATHS[rest]], request)
         raise Refusal(HTTPStatus.NOT_FOUND, "There is nothing here for this link.")
 
     def _check_websocket(self, request: Request, grant: Grant, rest: str) -> None:
         """Raise Refusal unless the role has a WebSocket at the rest of this path."""
-        if rest or (grant.role == "project" and self._projector.handler is None):
+        is_device = grant.role in DEVICE_PATHS.values()
+        if rest or (is_device and grant.role not in self._device_pages):
             raise Refusal(HTTPStatus.NOT_FOUND, "There is nothing here.")
-        if grant.role != "project" and request.headers.get_all("Sec-WebSocket-Protocol") != [self._subprotocol]:
+        if not is_device and request.headers.get_all("Sec-WebSocket-Protocol") != [self._subprotocol]:
             raise Refusal(HTTPStatus.BAD_REQUEST, "This page is of another version: reload it.")
 
     def _log_in(self, connection: Connection, request: Request) -> Response:

@@ -33,6 +33,16 @@ def listen(host: str, port: int) -> Listener:
     return sock
 
 
+def network_address() -> str | None:
+    """Return the address of this machine in its network, which the system would send from; None without a network."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        try:
+            sock.connect(("192.0.2.1", 9))  # an address for documentation (RFC 5737); nothing is sent
+        except OSError:
+            return None
+        return str(sock.getsockname()[0])
+
+
 def _resolve(host: str, port: int) -> tuple[int, tuple]:
     """Address family and socket address of host and port; raises SlviewerError if the name does not resolve in time."""
     candidates: list[tuple[int, tuple]] = []

@@ -18,6 +18,7 @@ from typing import Any
 
 from slviewer.errors import SlviewerError, UsageError
 from slviewer.server.access import ROLES, Role
+from slviewer.server.binding import network_address
 
 _MOST_BYTES = 4096
 _VALID_DAYS = 397
@@ -123,8 +124,7 @@ def _list_names(host: str, names: tuple[str, ...]) -> set[str]:
     wanted = {"localhost", "127.0.0.1", "::1", machine, f"{machine}.local", *given}
     with contextlib.suppress(ValueError):
         address = ipaddress.ip_address(host)
-        if not address.is_unspecified:
-            wanted.add(str(address))
+        wanted |= {str(address)} if not address.is_unspecified else {found} if (found := network_address()) else set()
     return wanted
 
 

@@ -22,6 +22,7 @@ MESSAGES: dict[Role, frozenset[type]] = {
     # viewpoint, and confirmation that something was drawn where that is requested
     "watch": frozenset({messages.ViewerCameraMessage, messages.LocalStorageGetItemResponseMessage}),
     "project": frozenset(),
+    "camera": frozenset(),
 }
 """The messages of viser that each role may send; all others, and those of later versions, are refused."""
 TEXT_LIMIT = 20_000

@@ -15,7 +15,7 @@ logger = logging.getLogger("slviewer.server")
 
 STRANGERS, STRANGERS_PER_ADDRESS = 256, 128
 """Connections without a valid cookie, in all and from one address; beyond, the oldest one is closed."""
-CONNECTIONS: dict[Role, int] = {"operate": 64, "watch": 64, "project": 16}
+CONNECTIONS: dict[Role, int] = {"operate": 64, "watch": 64, "project": 16, "camera": 16}
 """Connections with the cookie of a role; beyond, another one is refused."""
 ACCEPTED_AT_ONCE = 4
 """Connections accepted before those that are open are served again: about eight turns of the event loop serve a

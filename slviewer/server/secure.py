@@ -12,8 +12,8 @@ from websockets.asyncio.server import serve as serve_websockets
 
 from slviewer.server import viser_internals
 from slviewer.server.access import Access, Role
-from slviewer.server.auth_middleware import AuthMiddleware, ProjectorPage
-from slviewer.server.binding import listen
+from slviewer.server.auth_middleware import AuthMiddleware, DevicePage
+from slviewer.server.binding import listen, network_address
 from slviewer.server.connection import REQUEST_SECONDS, Connection, quiet_logger
 from slviewer.server.credentials import Certificate, load_tokens, save_tokens, self_made_certificate
 from slviewer.server.downloads import Downloads
@@ -47,10 +47,10 @@ class Serving:
 
 @dataclass(frozen=True)
 class SafeServer:
-    """A running server: build the page with `viser`, offer files with `downloads`, set the page of `projector`."""
+    """A running server: build the page with `viser`, offer files with `downloads`, set the `device_pages` by role."""
 
     viser: viser.ViserServer
-    projector: ProjectorPage
+    device_pages: dict[Role, DevicePage]
     downloads: Downloads
     serving: Serving
     access: Access
@@ -65,14 +65,22 @@ class SafeServer:
     @property
     def origin(self) -> str:
         """Scheme, host and port of its address."""
-        return f"{'https' if self.certificate else 'http'}://{self._format_host()}:{self.port}"
+        return self._format_origin(self._format_host())
+
+    @property
+    def shared_origin(self) -> str:
+        """Scheme, host and port for other devices: the address in the network, where all addresses are open."""
+        address = ipaddress.ip_address(self._address())
+        found = network_address() if address.is_unspecified else None
+        return self._format_origin(found or self._format_host())
 
     def link(self, role: Role = "operate", origin: str | None = None) -> str:
         """The link of a role, with its token behind the #, which browsers do not send; as secret as a password.
 
         `origin` (scheme, host, port) is the address to use where that is another one than the server's own.
         """
-        return f"{origin or self.origin}/#{self.access.grants[role].token}"
+        own = self.origin if role == "operate" else self.shared_origin
+        return f"{origin or own}/#{self.access.grants[role].token}"
 
     def one_time_link(self) -> str:
         """A link for the operator's browser that can be opened once, soon."""
@@ -110,6 +118,10 @@ class SafeServer:
         """End all connections, the server and its threads."""
         viser_internals.stop(self.viser)
 
+    def _format_origin(self, host: str) -> str:
+        """Scheme, host and port."""
+        return f"{'https' if self.certificate else 'http'}://{host}:{self.port}"
+
     def _address(self) -> str:
         """The IP address that the server listens at, without an IPv6 zone."""
         return self.viser.get_host().partition("%")[0]
@@ -143,12 +155,13 @@ def serve(serving: Serving, *, label: str | None = None, upload_limit: int = 256
     try:
         access = Access(port, tokens, serving.names, tls=certificate is not None)
         admissions = Admissions(sock)
-        projector, downloads = ProjectorPage(), Downloads()
+        device_pages: dict[Role, DevicePage] = {}
+        downloads = Downloads()
         scripts = (*viser_internals.VISER_SCRIPTS, script_hash(viser_internals.PAGE_SCRIPT))
         middleware = AuthMiddleware(
             access,
             admissions,
-            projector,
+            device_pages,
             downloads,
             viser_internals.client_page(),
             scripts,
@@ -162,10 +175,10 @@ def serve(serving: Serving, *, label: str | None = None, upload_limit: int = 256
             """Start viser's WebSocket server behind the middleware, in place of its own."""
 
             async def handle(connection: ServerConnection) -> None:
-                """Handle a WebSocket: of the projector page, else by viser behind a gate."""
+                """Handle a WebSocket: of a device's page, else by viser behind a gate."""
                 assert isinstance(connection, Connection)
-                if connection.role == "project" and projector.handler is not None:
-                    await projector.handler(connection)
+                if connection.role in device_pages:
+                    await device_pages[connection.role].handler(connection)
                 elif connection.role in ("operate", "watch") and started:
                     gate = connection.gate = ViserGate(started[0], connection, connection.role, budget)
                     try:
@@ -192,4 +205,4 @@ def serve(serving: Serving, *, label: str | None = None, upload_limit: int = 256
     except BaseException:
         sock.close()
         raise
-    return SafeServer(server, projector, downloads, replace(serving, port=port), access, admissions, certificate)
+    return SafeServer(server, device_pages, downloads, replace(serving, port=port), access, admissions, certificate)

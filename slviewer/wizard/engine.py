@@ -22,7 +22,7 @@ from slviewer.errors import DamagedError, InputError, SessionError, SlviewerErro
 from slviewer.pipeline.check_results import Preflight
 from slviewer.pipeline.frame_check import load_check, load_or_save_check
 from slviewer.pipeline.poses import read_stored_poses
-from slviewer.pipeline.rig_choice import Choice, RigSetup, SetUp, needs_page
+from slviewer.pipeline.rig_choice import Choice, RigSetup, SetUp, list_needed_pages
 from slviewer.pipeline.rig_presets import save_rig
 from slviewer.session.capture import Capture
 from slviewer.session.reading import expand_user
@@ -388,7 +388,7 @@ class Engine:
             T[:3, :3], T[:3, 3] = pose.R, pose.t
             world = WorldView(bench.world.standing, T, bench.world.turn_deg)
         rig = replace(
-            rig, simulated=world is not None, choice=choice, needs_page=choice is not None and needs_page(choice)
+            rig, simulated=world is not None, choice=choice, pages=() if choice is None else list_needed_pages(choice)
         )
         return Snapshot(
             version=version,

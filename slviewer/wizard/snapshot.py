@@ -11,6 +11,7 @@ import numpy as np
 from slviewer.calibration.diagnosis.verdict import Verdict
 from slviewer.calibration.next_pose import Coverage, Suggestion
 from slviewer.calibration.stereo import StereoModel
+from slviewer.devices.browser import PageRole
 from slviewer.devices.world import Thing
 from slviewer.evaluation.crossvalidation import CrossValidation
 from slviewer.pipeline.align import Placement
@@ -93,7 +94,7 @@ class RigView:
     fault: str = ""  # why it is lost
     capture: CaptureProgress | None = None
     choice: Mapping[str, Any] | None = None  # as the operator chose it
-    needs_page: bool = False  # whether it needs the projector page
+    pages: tuple[PageRole, ...] = ()  # its devices that are pages in a browser
     notes: tuple[str, ...] = ()  # settings that its camera refused
     turntable: str = ""  # its name; empty: the rig has none
 

@@ -3,9 +3,9 @@
 import msgspec
 import pytest
 
-from slviewer.devices.browser import browser_projector
-from slviewer.devices.channel import Channel, PageState
+from slviewer.devices.browser_projector import ProjectorChannel, browser_projector
 from slviewer.devices.drivers import driver
+from slviewer.devices.page_channel import PageState
 from slviewer.devices.screen import Screen, refusal
 from slviewer.errors import DeviceError, InputError
 
@@ -60,25 +60,25 @@ def test_windows_that_would_spoil_patterns_are_refused_with_what_to_change(shown
 
 
 def test_without_a_server_the_driver_says_who_has_one():
-    assert driver("browser").channel and not driver("browser").missing
+    assert driver("browser").page and not driver("browser").missing
     with pytest.raises(DeviceError, match="slviewer wizard"):
         browser_projector()
 
 
 def test_the_size_is_the_pages_unless_it_is_given():
-    channel = Channel()
+    channel = ProjectorChannel()
     assert browser_projector([912, 1140], channel).size == (912, 1140)
     with pytest.raises(DeviceError):
-        browser_projector(channel=channel)
+        browser_projector(page=channel)
     channel.connect(hello(), lambda message: None)
-    assert browser_projector(channel=channel).size == (1920, 1080)
+    assert browser_projector(page=channel).size == (1920, 1080)
     for size in ([0, 5], [5], [1.5, 2], "912x1140"):
         with pytest.raises(InputError):
             browser_projector(size, channel)  # type: ignore[arg-type]
 
 
 def test_no_page_is_said_at_once():
-    projector = browser_projector([912, 1140], Channel())
+    projector = browser_projector([912, 1140], ProjectorChannel())
     for _ in range(2):
         with pytest.raises(DeviceError):
             projector.open()
@@ -88,7 +88,7 @@ def test_no_page_is_said_at_once():
 
 
 def test_one_window_is_the_projector_until_another_is_asked_for():
-    channel, sent = Channel(), {"first": [], "again": [], "other": []}
+    channel, sent = ProjectorChannel(), {"first": [], "again": [], "other": []}
     assert channel.page_state() == PageState("waiting", "waiting for the page")
     first = channel.connect(hello("a"), sent["first"].append)
     assert channel.page_state() == PageState("ready", "ready 1920 x 1080", (1920, 1080))
@@ -104,7 +104,7 @@ def test_one_window_is_the_projector_until_another_is_asked_for():
 
 
 def test_what_the_page_says_is_judged_by_what_is_expected():
-    channel, sent = Channel(), []
+    channel, sent = ProjectorChannel(), []
     page = channel.connect(hello(), sent.append)
     channel.set_pattern_size((912, 1140))
     assert channel.page_state().state == "refused" and "912 x 1140" in channel.page_state().words
@@ -131,7 +131,7 @@ def test_what_the_page_says_is_judged_by_what_is_expected():
     ],
 )
 def test_nonsense_is_refused(message):
-    channel = Channel()
+    channel = ProjectorChannel()
     page = channel.connect(hello(), lambda message: None)
     with pytest.raises(InputError):
         channel.handle_message(page, message)

@@ -6,9 +6,8 @@ import pytest
 from colour_camera import ColouredCamera, coloured
 from faulty_rig import breakable
 
-from slviewer.devices.browser import BrowserProjector
+from slviewer.devices.browser_projector import BrowserProjector, ProjectorChannel
 from slviewer.devices.capture import capture, capture_texture, capture_with_texture
-from slviewer.devices.channel import Channel
 from slviewer.devices.protocols import CameraSettings, ColourCamera, Rig
 from slviewer.devices.replay import replay
 from slviewer.devices.screen import Screen
@@ -109,7 +108,7 @@ def test_a_colour_camera_brings_its_colours_home():
 class _Page:
     """A projector page that says at once that it has done what it was asked."""
 
-    def __init__(self, channel: Channel, size: tuple[int, int]) -> None:
+    def __init__(self, channel: ProjectorChannel, size: tuple[int, int]) -> None:
         shown = Screen(1.0, size, size, size, True, True, True, 1.0)
         hello = {"op": "hello", "window": "a", "take": False, "screen": shown}
         self._channel, self.asked = channel, []
@@ -125,7 +124,7 @@ class _Page:
 
 
 def test_a_page_that_is_reloaded_between_two_exposures_ends_the_capture():
-    channel, camera = Channel(), rig().camera
+    channel, camera = ProjectorChannel(), rig().camera
     first = _Page(channel, SEQUENCE.projector)
     with Rig("r", camera, BrowserProjector(channel, SEQUENCE.projector)).opened() as one:
         assert len(capture_with_texture(one, SEQUENCE, (0.5, 4.0)).frames) == 2 * N

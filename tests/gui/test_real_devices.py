@@ -10,7 +10,7 @@ import numpy as np
 from playwright.sync_api import Browser, Page, expect
 from wizard_page import SIZE, Opened, button, choose, field
 
-from slviewer.devices.channel import Channel
+from slviewer.devices.browser import PageChannels
 from slviewer.fringe.decode import decode
 from slviewer.gui.app import App
 from slviewer.pipeline.rig_choice import set_up
@@ -43,12 +43,12 @@ def watch(operator: Operator, page: Page, camera: NetworkCamera, until: str, con
 
 
 def test_a_network_camera_and_a_browser_capture_what_is_projected(browser: Browser, tmp_path: Path) -> None:
-    channel = Channel()
+    pages = PageChannels()
     with (
         network_camera(np.full((SCREEN[1], SCREEN[0], 3), 40, np.uint8)) as camera,
-        Operator(tmp_path / "session", set_up=partial(set_up, channel=channel)) as operator,
+        Operator(tmp_path / "session", set_up=partial(set_up, pages=pages)) as operator,
     ):
-        app = App(operator, Serving(port=0), channel=channel)
+        app = App(operator, Serving(port=0), pages=pages)
         page = browser.new_context(viewport=SIZE).new_page()  # type: ignore[arg-type]
         projector = browser.new_context(viewport={"width": SCREEN[0], "height": SCREEN[1]}).new_page()
         opened = Opened(page)

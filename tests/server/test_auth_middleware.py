@@ -14,6 +14,7 @@ from websockets.exceptions import InvalidStatus
 from slviewer.errors import SlviewerError, UsageError
 from slviewer.server import access, connection
 from slviewer.server.access import ROLES, Access, Refusal
+from slviewer.server.auth_middleware import DevicePage
 from slviewer.server.credentials import load_tokens
 from slviewer.server.secure import Serving, serve
 
@@ -30,7 +31,7 @@ def test_a_link_is_exchanged_for_a_cookie_of_its_own_path(server, stranger, role
     assert "HttpOnly" in cookie and "SameSite=Strict" in cookie and "no-store" in answer.headers["Cache-Control"]
     assert token not in cookie and token not in str(answer.headers) and token.encode() not in answer.content
     assert stranger.path == f"{grant.path}/"
-    if role != "project":
+    if role not in ("project", "camera"):
         assert b"<title>Viser</title>" in stranger.get().content
         assert stranger.open().close() is None
 
@@ -183,13 +184,14 @@ def test_a_file_of_no_tokens_is_refused(tmp_path, content):
 
 
 ROUTES = {
-    "": {"operate": 200, "watch": 200, "project": 200},
-    "favicon.ico": {"operate": 204, "watch": 204, "project": 204},
-    "projector": {"operate": 303, "watch": 404, "project": 404},
-    "download/{offered}": {"operate": 200, "watch": 200, "project": 404},
-    "download/x": {"operate": 404, "watch": 404, "project": 404},
-    "login": {"operate": 404, "watch": 404, "project": 404},
-    "x": {"operate": 404, "watch": 404, "project": 404},
+    "": {"operate": 200, "watch": 200, "project": 200, "camera": 200},
+    "favicon.ico": {"operate": 204, "watch": 204, "project": 204, "camera": 204},
+    "projector": {"operate": 303, "watch": 404, "project": 404, "camera": 404},
+    "camera": {"operate": 303, "watch": 404, "project": 404, "camera": 404},
+    "download/{offered}": {"operate": 200, "watch": 200, "project": 404, "camera": 404},
+    "download/x": {"operate": 404, "watch": 404, "project": 404, "camera": 404},
+    "login": {"operate": 404, "watch": 404, "project": 404, "camera": 404},
+    "x": {"operate": 404, "watch": 404, "project": 404, "camera": 404},
 }
 """Statuses of what stands below the path of each role."""
 
@@ -197,11 +199,11 @@ ROUTES = {
 @pytest.mark.parametrize("role", ROLES)
 def test_every_route_of_every_role(server, stranger, role, tmp_path):
     async def handle(connection):
-        await connection.send("projector page")
+        await connection.send(f"{connection.role} page")
 
     (tmp_path / "a.txt").write_text("a")
     offered = server.downloads.offer(tmp_path / "a.txt", within=tmp_path).partition("/")[2]
-    server.projector.html, server.projector.handler = b"page", handle
+    server.device_pages.update({device: DevicePage(b"page", handle) for device in ("project", "camera")})
     mine = Browser(server, role)
     for route, statuses in ROUTES.items():
         path = route.format(offered=offered)
@@ -219,9 +221,9 @@ def test_every_route_of_every_role(server, stranger, role, tmp_path):
             with pytest.raises(InvalidStatus):
                 mine.open(path)
     with mine.open() as socket_:
-        if role == "project":
-            assert socket_.recv(2) == "projector page"
-    server.projector.handler = None
+        if role in ("project", "camera"):
+            assert socket_.recv(2) == f"{role} page"
+    server.device_pages.clear()
 
 
 @pytest.mark.parametrize(
@@ -396,7 +398,7 @@ def test_it_serves_this_machine_alone_unless_told(server):
 def test_tokens_are_long_and_differ():
     grants = Access(1).grants.values()
     assert all(len(grant.token) >= 32 for grant in grants)
-    assert len({one for grant in grants for one in (grant.token, grant.value, grant.path)}) == 9
+    assert len({one for grant in grants for one in (grant.token, grant.value, grant.path)}) == 3 * len(ROLES)
     for token in ("", "\udce9", "x" * 300):
         with pytest.raises(Refusal):
             Access(1).exchange(token, "127.0.0.1")

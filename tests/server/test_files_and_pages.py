@@ -15,6 +15,7 @@ from websockets.exceptions import InvalidStatus
 
 from slviewer.errors import InputError
 from slviewer.server import connection
+from slviewer.server.auth_middleware import DevicePage
 from slviewer.server.connection import CHUNK
 from slviewer.server.text import escape, safe_name
 
@@ -116,7 +117,7 @@ def test_the_projector_page_has_a_link_of_its_own(server, operator, watcher, pro
         async for message in connection:
             await connection.send(f"{connection.role}: {message}")
 
-    server.projector.html, server.projector.handler = PAGE.encode(), echo
+    server.device_pages["project"] = DevicePage(PAGE.encode(), echo)
     answer = projector_page.get()
     assert answer.status == 200 and answer.content.decode() == PAGE
     script = base64.b64encode(hashlib.sha256(b"let a = 1").digest()).decode()
@@ -131,7 +132,7 @@ def test_the_projector_page_has_a_link_of_its_own(server, operator, watcher, pro
     assert led.status == 303 and led.headers["Location"] == projector_page.path
     assert led.headers["Set-Cookie"].startswith(f"{projector_page.cookie};")
     assert watcher.get("projector").status == 404 and stranger.get("/projector").status == 403
-    server.projector.handler = None
+    server.device_pages.clear()
     assert projector_page.get().status == 404 and operator.get("projector").status == 404
     with pytest.raises(InvalidStatus):
         projector_page.open()
@@ -141,10 +142,10 @@ def test_a_failing_endpoint_takes_nothing_with_it(server, operator, projector_pa
     async def fail(connection) -> None:
         raise RuntimeError("broken")
 
-    server.projector.handler = fail
+    server.device_pages["project"] = DevicePage(PAGE.encode(), fail)
     socket_ = projector_page.open()
     assert until(lambda: socket_.close_code == 1011)
-    server.projector.handler = None
+    server.device_pages.clear()
     assert operator.client().number >= 0
 
 

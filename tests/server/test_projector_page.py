@@ -11,13 +11,13 @@ from playwright.sync_api import Browser, Page, expect
 from server_client import until
 from websockets.exceptions import ConnectionClosed
 
-from slviewer.devices.browser import BrowserProjector, browser_projector
-from slviewer.devices.channel import Channel
+from slviewer.devices.browser import PageChannels
+from slviewer.devices.browser_projector import BrowserProjector, ProjectorChannel, browser_projector
 from slviewer.errors import DeviceError, InputError
 from slviewer.fringe.patterns import render
 from slviewer.fringe.presets import complementary
 from slviewer.fringe.sequence import Frame, PatternSequence
-from slviewer.server.projector_page import serve_projector
+from slviewer.server.device_pages import serve_device_pages
 from slviewer.server.secure import SafeServer, Serving, serve
 
 SIZE = (360, 270)
@@ -30,11 +30,11 @@ Opens = Callable[..., Page]
 
 
 @pytest.fixture
-def channel(server: SafeServer) -> Iterator[Channel]:
-    channel = Channel()
-    serve_projector(server, channel)
+def channel(server: SafeServer) -> Iterator[ProjectorChannel]:
+    channel = ProjectorChannel()
+    serve_device_pages(server, PageChannels(projector=channel))
     yield channel
-    server.projector.handler = None
+    server.device_pages.clear()
 
 
 @pytest.fixture
@@ -61,7 +61,7 @@ def opens(browser: Browser, server: SafeServer) -> Iterator[Opens]:
 
 
 @pytest.fixture
-def projector(channel: Channel) -> Iterator[BrowserProjector]:
+def projector(channel: ProjectorChannel) -> Iterator[BrowserProjector]:
     projector = browser_projector(SIZE, channel)
     yield projector
     projector.close()
@@ -76,7 +76,7 @@ def shows(page: Page, picture: np.ndarray) -> bool:
     return np.array_equal(seen(page), np.repeat(picture[..., None], 3, axis=2))
 
 
-def ready(channel: Channel, projector: BrowserProjector) -> None:
+def ready(channel: ProjectorChannel, projector: BrowserProjector) -> None:
     """Open, with the sequence loaded."""
     assert channel.wait_ready(10.0).state == "ready", channel.page_state()
     projector.open()
@@ -266,7 +266,7 @@ def test_a_lost_connection_is_made_again_by_the_page(opens, channel, projector):
 
 def test_a_server_that_starts_again_finds_its_page(browser, channel, tmp_path):
     server = serve(Serving(port=0, token_file=tmp_path / "tokens.toml"))
-    serve_projector(server, channel)
+    serve_device_pages(server, PageChannels(projector=channel))
     page = browser.new_page(viewport={"width": 360, "height": 270})
     page.goto(server.link("project"))
     assert channel.wait_ready(5.0).state == "ready"
@@ -274,7 +274,7 @@ def test_a_server_that_starts_again_finds_its_page(browser, channel, tmp_path):
     expect(page.locator("h1")).to_have_text("slviewer does not answer")
     assert channel.page_state().state == "waiting"
     again = serve(server.serving)
-    serve_projector(again, channel)
+    serve_device_pages(again, PageChannels(projector=channel))
     assert channel.wait_ready(8.0).state == "ready"
     page.close()
     again.stop()

@@ -1,14 +1,18 @@
-"""The page of a browser projector, and the messages between it and the server."""
+"""The pages of a browser's projector and camera, and the messages between them and the server."""
 
 import asyncio
 import contextlib
 from importlib import resources
+from typing import Any
 
 from websockets.asyncio.server import ServerConnection
 from websockets.exceptions import ConnectionClosed
 
-from slviewer.devices.channel import Channel
+from slviewer.devices.browser import PageChannels
+from slviewer.devices.page_channel import PageChannel
 from slviewer.errors import InputError
+from slviewer.server.access import Role
+from slviewer.server.auth_middleware import DevicePage
 from slviewer.server.secure import SafeServer
 
 ANOTHER_WINDOW, NOT_UNDERSTOOD = 4001, 1008
@@ -16,20 +20,26 @@ ANOTHER_WINDOW, NOT_UNDERSTOOD = 4001, 1008
 _HELLO_S = 5.0
 
 
-def serve_projector(server: SafeServer, channel: Channel) -> None:
-    """Serve the page at `server.link("project")`, and connect it to `channel`."""
-    html = resources.files("slviewer.server").joinpath("projector.html").read_text("utf-8")
+def serve_device_pages(server: SafeServer, channels: PageChannels) -> None:
+    """Serve the pages at `server.link("project")` and `server.link("camera")`, and connect them to `channels`."""
+    _serve_page(server, "project", "projector.html", channels.projector)
+    _serve_page(server, "camera", "camera.html", channels.camera)
+
+
+def _serve_page(server: SafeServer, role: Role, name: str, channel: PageChannel[Any]) -> None:
+    """Serve the page of one role."""
 
     async def handle(connection: ServerConnection) -> None:
         """Exchange messages with a page until it disconnects."""
         with contextlib.suppress(ConnectionClosed):
             await _talk(connection, channel)
 
-    server.projector.html, server.projector.handler = html.encode(), handle
+    html = resources.files("slviewer.server").joinpath(name).read_bytes()
+    server.device_pages[role] = DevicePage(html, handle)
 
 
-async def _talk(connection: ServerConnection, channel: Channel) -> None:
-    """Exchange messages between a projector page and its channel until one side ends the connection."""
+async def _talk(connection: ServerConnection, channel: PageChannel[Any]) -> None:
+    """Exchange messages between a page and its channel until one side ends the connection."""
     loop, outbox = asyncio.get_running_loop(), asyncio.Queue[bytes | None]()
 
     def send(message: bytes | None) -> None:
@@ -41,7 +51,7 @@ async def _talk(connection: ServerConnection, channel: Channel) -> None:
         """Send queued messages to the page, and close the connection after the last."""
         while (message := await outbox.get()) is not None:
             await connection.send(message)
-        await connection.close(ANOTHER_WINDOW, "another window is the projector")
+        await connection.close(ANOTHER_WINDOW, "another window is the device")
 
     try:
         page = channel.connect(await asyncio.wait_for(connection.recv(), _HELLO_S), send)
@@ -49,7 +59,7 @@ async def _talk(connection: ServerConnection, channel: Channel) -> None:
         await connection.close(NOT_UNDERSTOOD, "not understood")
         return
     if page is None:
-        await connection.close(ANOTHER_WINDOW, "another window is the projector")
+        await connection.close(ANOTHER_WINDOW, "another window is the device")
         return
     writer = asyncio.create_task(write())
     try:

@@ -1,0 +1,233 @@
+"""A camera that anybody has: a page, open on a phone or laptop, that sends its camera's pictures without loss.
+
+The page waits for a picture that the camera took after the request, takes it from a canvas, and sends one channel of it
+uncompressed (1 byte a pixel), or three. While the camera is in use, the page locks exposure, focus and white balance as
+far as the browser lets it; what stays automatic is reported in `notes`.
+"""
+
+import struct
+from collections.abc import Sequence
+from typing import Annotated, Any, Literal, get_args
+
+import msgspec
+import numpy as np
+
+from slviewer.devices.opening import Openable
+from slviewer.devices.page_channel import Done, PageChannel, PageConnection
+from slviewer.devices.protocols import CameraSettings, Channel, check_frame
+from slviewer.errors import DeviceError, InputError
+
+FRAME_S = 10.0
+"""How long a picture may take, from the request until it has arrived here."""
+_LOCK_S = 8.0
+"""How long the camera may take to reach the settings that it is locked at."""
+_MAX_SIDE_PX = 2**13
+
+_Text = Annotated[str, msgspec.Meta(max_length=200)]
+_Side = Annotated[int, msgspec.Meta(ge=1, le=_MAX_SIDE_PX)]
+_Milliseconds = Annotated[float, msgspec.Meta(gt=0, le=600_000)]
+_PROBLEMS = {
+    "insecure": "the browser gives its camera to encrypted pages alone: start slviewer with --tls, and open the "
+    "camera page's new link",
+    "NotAllowedError": "the browser refused the camera page its camera: allow it beside the page's address, then "
+    "reload the page",
+    "NotFoundError": "the camera page's device has no camera: open the page on another one",
+    "NotReadableError": "the camera page cannot read its camera: close other programs that use it, then reload it",
+}
+
+
+class Video(msgspec.Struct, frozen=True):
+    """The camera of the page, as it reports it.
+
+    `size`: (width, height) px of its pictures; None while there are none, and then `problem` is the name of the
+    browser's error, "insecure" where the page is not encrypted, or "" while it starts. `label`: the browser's name for
+    it. `automatic`: what the browser does not lock. `exposure_ms`: None where the browser does not report it.
+    `visible`: whether the page is in front; hidden ones get no pictures.
+    """
+
+    size: tuple[_Side, _Side] | None
+    problem: _Text
+    label: _Text
+    automatic: tuple[Literal["exposure", "focus", "white balance"], ...]
+    exposure_ms: _Milliseconds | None
+    visible: bool
+
+
+class Hello(msgspec.Struct, tag_field="op", tag="hello"):
+    """The page's first message; `window` is the same after a reload, `take`: it requests to be the camera."""
+
+    window: str
+    take: bool
+    video: Video
+
+
+class Report(msgspec.Struct, tag_field="op", tag="video"):
+    """Message of the page that its camera has changed."""
+
+    video: Video
+
+
+class CameraChannel(PageChannel[Video]):
+    """Connects a camera to its page."""
+
+    name = "the camera page"
+    remedy = "open the camera's link on the phone or laptop whose camera is used"
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._frame_size: tuple[int, int] | None = None
+
+    def set_use(self, size: tuple[int, int] | None) -> None:
+        """Judge pages by pictures of this size (width, height) from now on; None: no camera is open."""
+        with self._condition:
+            self._frame_size = size
+            self._publish_state()
+
+    def _read_hello(self, message: str | bytes) -> tuple[str, bool, Video]:
+        hello: Hello = self._decode(message, Hello)
+        return hello.window, hello.take, hello.video
+
+    def _read_message(self, message: str | bytes) -> tuple[Done, bytes] | Video:
+        if isinstance(message, str):
+            incoming = self._decode(message, Report | Done)
+            return (incoming, b"") if isinstance(incoming, Done) else incoming.video
+        start = 4 + struct.unpack("<I", message[:4])[0] if len(message) >= 4 else 4
+        return self._decode(message[4:start], Done), message[start:]
+
+    def _refuse(self, facts: Video) -> str:
+        if facts.size is None:
+            failed = f"the camera page has no pictures ({facts.problem or 'its camera is starting'})"
+            return _PROBLEMS.get(facts.problem, f"{failed}: wait a moment, else reload the page")
+        if not facts.visible:
+            return "the camera page is hidden: bring it to the front, and keep its screen on"
+        if self._frame_size not in (None, facts.size):
+            size, expected = ("{} x {}".format(*each) for each in (facts.size, self._frame_size or facts.size))
+            return (
+                f"the camera page's pictures have {size} px and no longer {expected}: turn the phone back and fix it, "
+                "or choose the rig again"
+            )
+        return ""
+
+    def _size(self, facts: Video) -> tuple[int, int] | None:
+        return facts.size
+
+    def _describe_state(self, facts: Video) -> tuple[Any, dict[str, Any]]:
+        in_use = self._frame_size is not None
+        return (facts.size, in_use), {"used": in_use}
+
+
+class BrowserCamera(Openable):
+    """One `channel` of the pictures of the camera on a page.
+
+    A capture that loses its page, or whose pictures change their size, ends with a DeviceError. A gain is not set:
+    browsers offer none that is a factor on the grey levels.
+    """
+
+    dtype = np.dtype(np.uint8)
+
+    def __init__(
+        self,
+        size: Sequence[int] | None = None,
+        exposure_ms: float | None = None,
+        channel: Channel = "green",
+        page: CameraChannel | None = None,
+    ) -> None:
+        """A camera of `size` (width, height) px, by default that of the connected page's camera; `channel` is what is
+        decoded, `page` leads to the page. `exposure_ms` is set when it is opened, where the browser lets it.
+
+        Raises DeviceError without a `page`, and where `size` is None and no page is ready.
+        """
+        if channel not in get_args(Channel):
+            raise InputError(f"no channel is called {channel!r}: use one of {', '.join(get_args(Channel))}")
+        if size is not None and (
+            len(size) != 2 or not all(isinstance(side, int) and 0 < side <= _MAX_SIDE_PX for side in size)
+        ):
+            raise InputError(f"{size!r} is no size of a camera: give its width and height in px, such as [1920, 1080]")
+        if page is None:
+            raise DeviceError(
+                "the browser camera's page is served by `slviewer wizard` and `slviewer capture`: use one of them"
+            )
+        super().__init__("the browser camera")
+        self._channel: Channel = channel
+        self._pages = page
+        self._exposure_ms = CameraSettings(exposure_ms).exposure_ms
+        self._page: PageConnection[Video] | None = None
+        self._note = ""
+        if size is None:
+            size = page.page_state().size
+            if size is None:
+                raise DeviceError("the camera's size is unknown: open the camera page first, or give the size")
+        self.size: tuple[int, int] = (size[0], size[1])
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Warnings about the settings, a sentence each."""
+        page, found = self._page, []
+        if page is not None and page.facts.automatic:
+            automatic = " and ".join(page.facts.automatic)
+            found.append(
+                f"its browser does not lock {automatic}: nothing may move or change its brightness during a capture; "
+                "Chrome on Android locks most"
+            )
+        return tuple(f"{self.name}: {sentence}" for sentence in (*found, self._note) if sentence)
+
+    def open(self) -> None:
+        """Lock what is automatic. Raises DeviceError with a remedy where the page has no pictures of this size."""
+        super().open()
+        try:
+            self._pages.set_use(self.size)
+            page = self._pages.page()
+            page.request("lock", timeout_s=_LOCK_S, exposure_ms=self._exposure_ms)
+            self._page = page
+        except BaseException:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """Release the page, which unlocks its camera; nothing happens when it is not open."""
+        if self._open:
+            self._pages.set_use(None)
+        self._page = None
+        super().close()
+
+    def grab(self, out: np.ndarray) -> None:
+        """Fill `out` (h, w) with a picture taken after this call."""
+        check_frame(self, out)
+        np.copyto(out, self._request_picture(self._channel, 1)[..., 0])
+
+    def grab_colour(self) -> np.ndarray:
+        """Grab a new (h, w, 3) RGB picture, as `grab`."""
+        return self._request_picture("rgb", 3)
+
+    def settings(self) -> CameraSettings:
+        """Read the exposure; None where the browser does not report it."""
+        return CameraSettings(self._require_page().facts.exposure_ms)
+
+    def apply(self, settings: CameraSettings) -> CameraSettings:
+        """Set the exposure; what could not be set is in `notes`."""
+        page, self._note = self._require_page(), ""
+        if settings.exposure_ms is not None:
+            page.request("lock", timeout_s=_LOCK_S, exposure_ms=settings.exposure_ms)
+            if page.facts.exposure_ms is None:
+                self._note = "its browser sets no exposure: change the light or the projector's brightness instead"
+        if settings.gain is not None:
+            self._note = "browsers set no gain: change the exposure instead"
+        return self.settings()
+
+    def _request_picture(self, channel: Channel | Literal["rgb"], depth: int) -> np.ndarray:
+        """Request a picture taken from now on, and return it, (h, w, depth) uint8."""
+        width, height = self.size
+        content = self._require_page().request("grab", timeout_s=FRAME_S, channel=channel, size=self.size)
+        if len(content) != width * height * depth:
+            raise DeviceError(
+                f"the camera page sent {len(content):,} bytes and not the {width * height * depth:,} of a picture: "
+                "reload it"
+            )
+        return np.frombuffer(content, np.uint8).reshape(height, width, depth)
+
+    def _require_page(self) -> PageConnection[Video]:
+        """Return the page that was locked when the camera was opened. Raises DeviceError where it was reloaded."""
+        self.check_open()
+        assert self._page is not None
+        self._page.check()
+        return self._page

@@ -1,0 +1,230 @@
+"""The message channel between a device that is a browser's page, and the page, on a server's event loop.
+
+The device's side, on the thread that owns it, sends requests and waits; the server's side connects and disconnects
+pages and passes messages on. One window at a time is the device: it stays so when it is reloaded, and another one takes
+over only when the user requests that in it. What the page reports of itself is judged here whether or not the device is
+open, and the page shows the same message as the operator's panel.
+"""
+
+import struct
+import threading
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Generic, Literal, TypeVar
+
+import msgspec
+
+from slviewer.errors import DeviceError, InputError
+
+ANSWER_S = 1.8
+"""A page that is alive answers within two animation frames; a request ends within two seconds unless it says more."""
+
+Send = Callable[[bytes | None], None]
+"""Queue a message for the page, from any thread, and return at once; None: end it, another window took over."""
+Facts = TypeVar("Facts")
+"""What a kind of page reports of itself."""
+
+
+class Done(msgspec.Struct, tag_field="op", tag="done"):
+    """Answer of the page: request `number` was carried out, or why it was not."""
+
+    number: int
+    why: str = ""
+
+
+@dataclass(frozen=True)
+class PageState:
+    """State of a page: "waiting" for one to be opened, "refused" or "ready", and a message in `words`.
+
+    `size` is the (width, height) px of the page's screen or camera, None while there is none.
+    """
+
+    state: Literal["waiting", "refused", "ready"]
+    words: str
+    size: tuple[int, int] | None = None
+
+
+class PageConnection(Generic[Facts]):
+    """One connection of a page. The device's thread sends requests, the server's stores the answers."""
+
+    def __init__(self, condition: threading.Condition, name: str, window: str, facts: Facts, send: Send) -> None:
+        self.window, self.facts = window, facts
+        self.send = send
+        self.changes = 0  # of what it reported since it connected
+        self.refused, self.gone = "", ""
+        self.published: Any = None
+        self._condition, self._name = condition, name
+        self._number = 0
+        self._answer: tuple[Done, bytes] | None = None
+
+    def request(self, op: str, payload: bytes = b"", timeout_s: float = ANSWER_S, **fields: Any) -> bytes:
+        """Send a request, wait until the page reports it done, and return what came with the answer.
+
+        Raises DeviceError within `timeout_s`.
+        """
+        with self._condition:
+            self._number += 1
+            self.check()
+            self.send(encode_message({"op": op, "number": self._number, **fields}, payload))
+            end = time.monotonic() + timeout_s
+            while self._answer is None or self._answer[0].number != self._number:
+                self.check()
+                remaining_s = end - time.monotonic()
+                if remaining_s <= 0:
+                    raise DeviceError(
+                        f"{self._name} did not answer within {timeout_s:g} s: look whether its window is covered, "
+                        "its computer asleep, or the network down"
+                    )
+                self._condition.wait(remaining_s)
+            done, content = self._answer
+            self._answer = None
+            if done.why:
+                raise DeviceError(f"{self._name} failed, {done.why}: reload it")
+            return content
+
+    def check(self) -> None:
+        """Raise DeviceError if the page is disconnected, or cannot be the device."""
+        if self.gone or self.refused:
+            raise DeviceError(self.gone or self.refused)
+
+    def store_answer(self, done: Done, content: bytes = b"") -> None:
+        """Store an answer for the waiting `request`."""
+        self._answer = done, content
+
+
+class PageChannel(ABC, Generic[Facts]):
+    """Connects a device to its page. Every method may be called from any thread; only `wait_ready` waits."""
+
+    name: str
+    """Of the page, to start a sentence with."""
+    remedy: str
+    """What to do where no page is connected."""
+
+    def __init__(self) -> None:
+        self._condition = threading.Condition()
+        self._page: PageConnection[Facts] | None = None
+
+    # what kinds of pages differ in
+
+    @abstractmethod
+    def _read_hello(self, message: str | bytes) -> tuple[str, bool, Facts]:
+        """Return the window, whether it requests to be the device, and what it reports. Raises InputError."""
+
+    @abstractmethod
+    def _read_message(self, message: str | bytes) -> tuple[Done, bytes] | Facts:
+        """Return an answer and what came with it, or what the page reports. Raises InputError."""
+
+    @abstractmethod
+    def _refuse(self, facts: Facts) -> str:
+        """Return why a page that reports this cannot be the device, with a remedy; "" where it can."""
+
+    @abstractmethod
+    def _size(self, facts: Facts) -> tuple[int, int] | None:
+        """Return the (width, height) px of the page's screen or camera."""
+
+    @abstractmethod
+    def _describe_state(self, facts: Facts) -> tuple[Any, dict[str, Any]]:
+        """Return a value that differs when the page has to learn its state anew, and the fields that describe it."""
+
+    # for panels that show the state
+
+    def page_state(self) -> PageState:
+        """Return the current state of the page."""
+        with self._condition:
+            page = self._page
+            if page is None:
+                return PageState("waiting", "waiting for the page")
+            size = self._size(page.facts)
+            if page.refused or size is None:
+                return PageState("refused", page.refused, size)
+            return PageState("ready", f"ready {size[0]} x {size[1]}", size)
+
+    def wait_ready(self, timeout_s: float) -> PageState:
+        """Wait until the page is ready, at most `timeout_s`; returns its state."""
+        with self._condition:
+            self._condition.wait_for(lambda: self.page_state().state == "ready", timeout_s)
+            return self.page_state()
+
+    # the device's side
+
+    def page(self) -> PageConnection[Facts]:
+        """Return the connected page, able to be the device. Raises DeviceError with a remedy."""
+        with self._condition:
+            if self._page is None:
+                raise DeviceError(f"no {self.name.removeprefix('the ')} is connected: {self.remedy}")
+            self._page.check()
+            return self._page
+
+    # the server's side
+
+    def connect(self, hello: str | bytes, send: Send) -> PageConnection[Facts] | None:
+        """Connect the page that sent `hello`; None where another window is the device. Raises InputError for an
+        invalid message.
+        """
+        window, take, facts = self._read_hello(hello)
+        with self._condition:
+            before = self._page
+            if before is not None:
+                if window != before.window and not take:
+                    return None
+                self._end_connection(
+                    before,
+                    f"{self.name} was reloaded, or connected anew"
+                    if window == before.window
+                    else f"another window was made {self.name}",
+                )
+                before.send(None)
+            page = self._page = PageConnection(self._condition, self.name, window, facts, send)
+            self._publish_state()
+            return page
+
+    def handle_message(self, page: PageConnection[Facts], message: str | bytes) -> None:
+        """Handle a message of a connected page. Raises InputError for an invalid one."""
+        incoming = self._read_message(message)
+        with self._condition:
+            if isinstance(incoming, tuple):
+                page.store_answer(*incoming)
+            elif incoming != page.facts:
+                page.facts = incoming
+                page.changes += 1
+                self._publish_state()
+            self._condition.notify_all()
+
+    def disconnect(self, page: PageConnection[Facts]) -> None:
+        """Handle the loss of a page's connection."""
+        with self._condition:
+            if self._page is page:
+                self._page = None
+                self._end_connection(page, f"{self.name} was closed, or its connection was lost")
+
+    def _end_connection(self, page: PageConnection[Facts], why: str) -> None:
+        """End a connection: requests to this page then raise DeviceError with the reason."""
+        page.gone = f"{why}: capture again once it is ready"
+        self._condition.notify_all()
+
+    def _publish_state(self) -> None:
+        """Judge what the page reports, and send the page its state if that has changed."""
+        page = self._page
+        if page is None:
+            return
+        page.refused = self._refuse(page.facts)
+        self._condition.notify_all()
+        state, fields = self._describe_state(page.facts)
+        if (page.refused, state) != page.published:
+            page.published = page.refused, state
+            page.send(encode_message({"op": "stand", "refused": page.refused, **fields}))
+
+    def _decode(self, message: str | bytes, kind: Any) -> Any:
+        """Decode a JSON message of the page as `kind`. Raises InputError for an invalid one."""
+        try:
+            return msgspec.json.decode(message, type=kind)
+        except (msgspec.MsgspecError, UnicodeError) as error:
+            raise InputError(f"{self.name} sent an invalid message ({error}): reload it") from error
+
+
+def encode_message(header: dict[str, Any], payload: bytes = b"") -> bytes:
+    """Encode a message: the header's length as 4 bytes, little endian, the header as JSON, then the payload."""
+    text = msgspec.json.encode(header)
+    return struct.pack("<I", len(text)) + text + payload

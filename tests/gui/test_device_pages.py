@@ -1,0 +1,82 @@
+"""The pages of projector and camera beside the wizard."""
+
+import base64
+from functools import partial
+
+import cv2
+import msgspec
+import numpy as np
+from playwright.sync_api import Browser, expect
+from wizard_page import button, choose
+
+from slviewer.devices.browser import PageChannels
+from slviewer.devices.browser_camera import Video
+from slviewer.devices.browser_projector import ProjectorChannel, browser_projector
+from slviewer.fringe.presets import gray
+from slviewer.gui.app import App
+from slviewer.gui.links import encode_qr_code
+from slviewer.pipeline.rig_choice import set_up
+from slviewer.server.secure import Serving
+from slviewer.wizard.operator import Operator
+
+VIDEO = Video((1920, 1080), "", "Back camera", (), 10.0, True)
+
+
+def test_the_wizard_serves_the_projector_page(browser: Browser) -> None:
+    channel = ProjectorChannel()
+    with Operator() as operator:
+        app = App(operator, Serving(port=0), pages=PageChannels(channel))
+        page = browser.new_page(viewport={"width": 320, "height": 240})
+        try:
+            page.goto(app.server.link("project"))
+            assert channel.wait_ready(10.0).words == "ready 320 x 240"
+            projector = browser_projector(page=channel)
+            projector.open()
+            projector.load(gray((320, 240)))
+            projector.show(0)
+            projector.close()
+        finally:
+            page.close()
+            app.close()
+
+
+def test_a_wizard_without_a_channel_has_no_such_page(browser: Browser) -> None:
+    with Operator() as operator:
+        app = App(operator, Serving(port=0))
+        page = browser.new_page()
+        try:
+            page.goto(app.server.link("project"))
+            expect(page.get_by_text("There is no such page here")).to_be_visible()
+        finally:
+            page.close()
+            app.close()
+
+
+def test_a_link_is_read_back_from_its_qr_code() -> None:
+    link = "https://192.168.1.20:8080/#oCRs5MUmmGxbcJl_PG-zfGJufRe80kDD"
+    png = base64.b64decode(encode_qr_code(link).partition(",")[2])
+    picture = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_GRAYSCALE)
+    scaled = cv2.resize(picture, None, fx=6, fy=6, interpolation=cv2.INTER_NEAREST)
+    assert cv2.QRCodeDetector().detectAndDecode(scaled)[0] == link
+    assert (picture[:4] == 255).all() and (picture[:, -4:] == 255).all(), "the quiet zone"
+
+
+def test_the_operator_sees_what_the_camera_page_needs(browser: Browser) -> None:
+    pages = PageChannels()
+    with Operator(set_up=partial(set_up, pages=pages)) as operator:
+        app = App(operator, Serving(port=0), pages=pages)
+        page = browser.new_page()
+        try:
+            page.goto(app.server.link())
+            button(page, "1. Rig").click()
+            choose(page, "Rig", "Custom …")
+            choose(page, "Camera", "browser: a page on a screen, phone or laptop")
+            expect(page.get_by_text("Camera page: waiting for the page")).to_be_visible()
+            hello = {"op": "hello", "window": "a", "take": False, "video": VIDEO}
+            pages.camera.connect(msgspec.json.encode(hello), lambda _: None)
+            expect(page.get_by_text("Camera page: ready 1920 x 1080")).to_be_visible()
+            button(page, "Use these devices").click()
+            expect(page.get_by_text("the projector's size is unknown").first).to_be_visible()
+        finally:
+            page.close()
+            app.close()
