@@ -1,12 +1,14 @@
-"""Errors of the phase where the surface's brightness jumps: the effect of the camera's blur on the fringes.
+"""Errors of the phase where the surface's brightness jumps, the effect of the camera's blur, and their correction.
 
 A camera pixel receives light from a neighbourhood, and more of it from the brighter side: the pixel's phase is that of
 a place displaced towards that side. For a Gaussian point spread of standard deviation s the displacement is s^2 grad(ln
 B), B being the blurred modulation (Tweedie's formula), so that the phase is off by s^2 grad(phi) . grad(ln B): at
-silhouettes, shadows and printed edges, by far more than noise.
+silhouettes, shadows and printed edges, by far more than noise. The blur is estimated from the steepness of the edges,
+then from the phase itself: a surface that continues across an edge shows how far the phase is off there.
 """
 
 import math
+from dataclasses import dataclass
 
 import cv2
 import numba
@@ -29,7 +31,41 @@ SHARPEST = 0.35
 """Quantile of the edges' widths that is used: shading and printed gradients are wider than a blurred step."""
 LEAST_PX = 0.3
 """Standard deviation of an ideal pixel's own aperture, 12 ** -0.5, rounded up."""
+SIGNIFICANT = 1.0
+"""Standard deviations of noise from which on a displacement takes part in the estimate of the blur."""
+REFINED = 300
+"""Number of such pixels below which nothing is corrected."""
+LEVELS = 6
+"""Bins between the levels on both sides of an edge; differences of pixels are steeper or flatter than the slope of a
+blurred step in each of them."""
+REFINED_AT_LEVEL = 50
+"""Number of pixels below which a bin has the factor of all."""
+REFINEMENT = (0.25, 2.5)
+"""Displacement over the one expected from the edges' steepness: outside of these bounds, what looks like printed edges
+is something else."""
+BENT, BENT_SIGMAS = 0.04, 4.0
+"""rad, and standard deviations of noise: phases on both sides of an edge that are further from one line are those of
+two surfaces, or of a crease."""
+REMAINING = 0.25
+"""Share of a corrected displacement that remains uncertain."""
 _STEP = math.sqrt(2 * math.pi)
+
+
+@dataclass(frozen=True, eq=False)
+class EdgeDisplacement:
+    """Displacement of a phase by the camera's blur.
+
+    ``shift``: (h, w) float32, measured less true phase, NaN where that is; ``is_continuous``: (h, w) bool, where the
+    surface continues across the edge and its phase confirms the shift, which can be subtracted there.
+    """
+
+    shift: NDArray[np.float32]
+    is_continuous: NDArray[np.bool_]
+
+    @property
+    def remaining(self) -> NDArray[np.float32]:
+        """(h, w) float32: error of a phase from which the shift was subtracted where the surface is continuous."""
+        return np.abs(self.shift) * np.where(self.is_continuous, np.float32(REMAINING), np.float32(1))
 
 
 def estimate_camera_blur(
@@ -72,23 +108,84 @@ def estimate_camera_blur(
     return blur
 
 
-def edge_error(phase: NDArray[np.float32], modulation: NDArray[np.float32], noise: float = 0.0) -> NDArray[np.float32]:
-    """Return the displacement of the ``phase`` (h, w) by the camera's blur: (h, w) float32 in its unit.
+def estimate_displacement(
+    phase: NDArray[np.float32], modulation: NDArray[np.float32], noise: float = 0.0
+) -> EdgeDisplacement:
+    """Estimate the displacement of the ``phase`` (h, w) rad by the camera's blur.
 
-    NaN where the phase is. ``modulation`` (h, w) grey levels, of standard deviation ``noise``. Depth jumps and glossy
-    edges add errors of their own.
+    ``modulation`` (h, w) grey levels, of standard deviation ``noise``. Depth jumps and glossy edges add errors of their
+    own.
     """
-    sigma = cv2.resize(
-        estimate_camera_blur(modulation, np.isfinite(phase), noise), phase.shape[::-1], interpolation=cv2.INTER_LINEAR
+    noise = max(noise, 1e-3)
+    blur = estimate_camera_blur(modulation, np.isfinite(phase), noise)
+    sigma = cv2.resize(blur, phase.shape[::-1], interpolation=cv2.INTER_LINEAR)
+    shift, is_continuous = np.empty_like(phase), np.zeros(phase.shape, bool)
+    level = np.zeros(phase.shape, np.uint8)
+    _displace(modulation, phase, sigma, np.float32(noise), shift, is_continuous, level)
+    factors = _confirm(phase, modulation, EdgeDisplacement(shift, is_continuous), level, float(blur.max()), noise)
+    is_continuous &= bool(factors.any())
+    np.multiply(shift, factors[level], out=shift, where=is_continuous)
+    return EdgeDisplacement(shift, is_continuous)
+
+
+def _confirm(
+    phase: NDArray[np.float32],
+    modulation: NDArray[np.float32],
+    displaced: EdgeDisplacement,
+    level: NDArray[np.uint8],
+    blur: float,
+    noise: float,
+) -> NDArray[np.float32]:
+    """Return the factor (LEVELS,) by which displacements become those of the phase from a straight line.
+
+    The line continues the phase of an edge's bright side, from beyond the reach of the ``blur``, px. 0 where too few
+    pixels show it, or it is not plausible at every level: shadows of a lamp out of focus, highlights and creases look
+    like printed edges, and displace otherwise.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        v, u = np.nonzero(displaced.is_continuous & (np.abs(displaced.shift) * modulation > SIGNIFICANT * noise))
+    height, width = phase.shape
+    far = _beyond_blur(blur)
+    inside = (v >= 2 * far) & (u >= 2 * far) & (v < height - 2 * far) & (u < width - 2 * far)
+    v, u = v[inside], u[inside]
+    if len(v) < REFINED:
+        return np.zeros(LEVELS, np.float32)
+    rise_u, rise_v = (modulation[v + k, u + 1 - k] - modulation[v - k, u - 1 + k] for k in (0, 1))
+    across = np.abs(rise_u) >= np.abs(rise_v)
+    dv, du = (
+        np.where(across, 0, np.sign(rise_v) * far).astype(int),
+        np.where(across, np.sign(rise_u) * far, 0).astype(int),
     )
-    error = np.empty_like(phase)
-    _compute_displacement(modulation, phase, sigma, np.float32(max(noise, 1e-3)), error)
-    return error
+    shift = displaced.shift[v, u]
+    ratio = (phase[v, u] - 2 * phase[v + dv, u + du] + phase[v + 2 * dv, u + 2 * du]) / shift
+    known = np.isfinite(ratio)
+    if np.count_nonzero(known) < REFINED:
+        return np.zeros(LEVELS, np.float32)
+    ratio, weight, bins = ratio[known], np.abs(shift[known]), level[v, u][known]
+    factors = np.full(LEVELS, _weighted_median(ratio, weight), np.float32)
+    for k in np.flatnonzero(np.bincount(bins, minlength=LEVELS) >= REFINED_AT_LEVEL):
+        factors[k] = _weighted_median(ratio[bins == k], weight[bins == k])
+    is_confirmed = REFINEMENT[0] <= factors.min() <= factors.max() <= REFINEMENT[1]
+    return factors if is_confirmed else np.zeros(LEVELS, np.float32)
+
+
+def _weighted_median(values: NDArray[np.float32], weights: NDArray[np.float32]) -> float:
+    """Return the median of values of these weights, all above 0."""
+    order = np.argsort(values)
+    total = np.cumsum(weights[order], dtype=np.float64)
+    return float(values[order[np.searchsorted(total, total[-1] / 2)]])
+
+
+@kernel()
+def _beyond_blur(sigma):
+    """Return the distance, px, at which a step ten times as bright as its other side displaces nothing any more."""
+    return int(np.float32(3) * sigma) + 1
 
 
 @kernel(parallel=True)
-def _compute_displacement(modulation, phase, sigma, noise, error):
-    """Fill ``error`` (h, w) with s^2 abs(grad(phi) . grad(ln B)) less the part that noise causes.
+def _displace(modulation, phase, sigma, noise, shift, is_continuous, level):
+    """Fill ``shift`` (h, w) with s^2 grad(phi) . grad(ln B) less the part that noise causes, ``is_continuous``, and
+    ``level`` with the pixel's place, 0 ... LEVELS - 1, between the dark and the bright side of an edge.
 
     Slopes of B are taken over about half a standard deviation, of phi on its brighter side.
     """
@@ -96,7 +193,7 @@ def _compute_displacement(modulation, phase, sigma, noise, error):
     for v in numba.prange(height):
         for u in range(width):
             if not np.isfinite(phase[v, u]):
-                error[v, u] = np.nan
+                shift[v, u] = np.nan
                 continue
             here = max(modulation[v, u], noise)
             reach = max(1, int(np.float32(0.5) * (sigma[v, u] + np.float32(1))))
@@ -109,9 +206,54 @@ def _compute_displacement(modulation, phase, sigma, noise, error):
             step_u, step_v = far if slope_u > 0 else -far, far if slope_v > 0 else -far
             along = _compute_slope(phase, v, u, 0, step_u)
             down = _compute_slope(phase, v, u, step_v, 0)
-            shift = along * slope_u + down * slope_v
+            found = along * slope_u + down * slope_v
             by_noise = np.float32(2) * (noise / here) ** 2 * ((along / span_u) ** 2 + (down / span_v) ** 2)
-            error[v, u] = np.sqrt(max(shift * shift - by_noise, np.float32(0))) * sigma[v, u] * sigma[v, u]
+            size = np.sqrt(max(found * found - by_noise, np.float32(0))) * sigma[v, u] * sigma[v, u]
+            shift[v, u] = size if found > 0 else -size
+            beyond = _beyond_blur(sigma[v, u])
+            if abs(slope_u) >= abs(slope_v):
+                one, other = modulation[v, max(u - beyond, 0)], modulation[v, min(u + beyond, width - 1)]
+                is_continuous[v, u] = _continues(phase, modulation, noise, v, u, 0, beyond)
+            else:
+                one, other = modulation[max(v - beyond, 0), u], modulation[min(v + beyond, height - 1), u]
+                is_continuous[v, u] = _continues(phase, modulation, noise, v, u, beyond, 0)
+            dark, bright = min(one, other), max(one, other)
+            place = (here - dark) / max(bright - dark, noise)
+            level[v, u] = int(min(max(place, np.float32(0)), np.float32(0.999)) * LEVELS)
+
+
+@kernel()
+def _continues(phase, modulation, noise, v, u, step_v, step_u):
+    """Return whether the phases one and two steps from a pixel lie on one line: no depth jump, no crease.
+
+    Beyond noise, and a little for curved surfaces and for what blur displaces beyond a step.
+    """
+    height, width = phase.shape
+    far_v, far_u = 2 * step_v, 2 * step_u
+    if v < far_v or u < far_u or v >= height - far_v or u >= width - far_u:
+        return False
+    first, before = phase[v - far_v, u - far_u], phase[v - step_v, u - step_u]
+    after, last = phase[v + step_v, u + step_u], phase[v + far_v, u + far_u]
+    if not (np.isfinite(first) and np.isfinite(before) and np.isfinite(after) and np.isfinite(last)):
+        return False
+    near = _square_noise(modulation, noise, v - step_v, u - step_u) + _square_noise(
+        modulation, noise, v + step_v, u + step_u
+    )
+    ends = _square_noise(modulation, noise, v - far_v, u - far_u) + _square_noise(
+        modulation, noise, v + far_v, u + far_u
+    )
+    jump = abs(np.float32(2) * (after - before) - last + first)
+    turn = abs(before - first - last + after)
+    allowed, sigmas = np.float32(BENT), np.float32(BENT_SIGMAS)
+    return jump < allowed + sigmas * np.sqrt(np.float32(4) * near + ends) and turn < allowed + sigmas * np.sqrt(
+        near + ends
+    )
+
+
+@kernel()
+def _square_noise(modulation, noise, v, u):
+    """Return the variance of a pixel's phase, rad^2."""
+    return (noise / max(modulation[v, u], noise)) ** 2
 
 
 @kernel()

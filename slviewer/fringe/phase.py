@@ -1,13 +1,19 @@
 """Phase map of one capture along one axis, and the reasons for masked pixels."""
 
-from dataclasses import dataclass
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from slviewer.errors import InputError
 from slviewer.fringe.sequence import Axis
+
+if TYPE_CHECKING:
+    from slviewer.fringe.edge_blur import EdgeDisplacement
 
 GRAY_SIGMA_CELLS = 12**-0.5
 """Standard deviation of a coordinate known only to its Gray cell, 0.29 px where cells are projector columns."""
@@ -107,17 +113,30 @@ class PhaseMap:
         return self.sigma_phase * np.float32(self.period_px / (2 * np.pi))
 
     @cached_property
-    def edge_error_px(self) -> np.ndarray:
-        """(h, w) float32 px: error of the coordinate due to the camera's blur where the surface's brightness jumps.
+    def edge_displacement(self) -> EdgeDisplacement:
+        """Displacement of the phase, rad, by the camera's blur where the surface's brightness jumps.
 
-        See `edge_blur`; 0 for Gray code alone, NaN where the phase is.
+        See `edge_blur`; 0 for Gray code alone.
         """
-        from slviewer.fringe.edge_blur import edge_error  # loads numba, which reading a phase does not need
+        from slviewer.fringe.edge_blur import EdgeDisplacement, estimate_displacement  # loads numba
 
         if self.steps == 0:
-            return self.phase * 0
+            return EdgeDisplacement(self.phase * 0, np.zeros(self.phase.shape, bool))
         a, b = self.noise
         some = np.s_[::8, ::8]
         level = float(np.mean(self.background[some], where=self.mask[some])) if self.mask[some].any() else 0.0
-        error = edge_error(self.phase, self.modulation, float(np.sqrt(max(a + b * level, 0.0) * 2 / self.steps)))
-        return error * np.float32(self.period_px / (2 * np.pi))
+        return estimate_displacement(
+            self.phase, self.modulation, float(np.sqrt(max(a + b * level, 0.0) * 2 / self.steps))
+        )
+
+    @property
+    def edge_error_px(self) -> np.ndarray:
+        """(h, w) float32 px: error of the coordinate due to the camera's blur, NaN where the phase is."""
+        return np.abs(self.edge_displacement.shift) * np.float32(self.period_px / (2 * np.pi))
+
+    def correct_edges(self) -> tuple[PhaseMap, np.ndarray]:
+        """Return the phase map without the displacement by the camera's blur where the surface continues across an
+        edge, and the error of its coordinate that remains, (h, w) float32 px, NaN where the phase is."""
+        moved = self.edge_displacement
+        corrected = np.where(moved.is_continuous, self.phase - moved.shift, self.phase)
+        return replace(self, phase=corrected), moved.remaining * np.float32(self.period_px / (2 * np.pi))

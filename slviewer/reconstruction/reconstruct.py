@@ -115,6 +115,7 @@ def _measure(model: Model, phase: PhaseMap) -> Measured:
         raise InputError(
             f"The phase of axis {phase.axis} repeats every {phase.unambiguous_px:g} px: resolve it by a depth range."
         )
+    phase, remaining_px = phase.correct_edges()
     points = model.points(phase)
     sigma = model.sigma_z(phase, points)
     noise_px = np.maximum(phase.sigma_px, np.float32(1e-9))
@@ -125,9 +126,9 @@ def _measure(model: Model, phase: PhaseMap) -> Measured:
         sigma = per_px * noise_px
     if phase.steps == 0:
         return points, sigma, None
-    spoilt = phase.edge_error_px > EDGE_SIGMAS * noise_px
+    spoilt = remaining_px > EDGE_SIGMAS * noise_px
     points[spoilt], sigma[spoilt] = np.nan, np.nan
-    return points, sigma, per_px * phase.edge_error_px
+    return points, sigma, per_px * remaining_px
 
 
 def _measure_all(model: Model, phases: Mapping[Axis, PhaseMap]) -> dict[Axis, Measured]:

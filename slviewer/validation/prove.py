@@ -8,15 +8,17 @@ from slviewer.pipeline.feedback import Progress, ignore_progress, part
 from slviewer.validation.proof import Proof
 from slviewer.validation.prove_accuracy import prove_accuracy
 from slviewer.validation.prove_causes import prove_causes
+from slviewer.validation.prove_edges import prove_edges
 from slviewer.validation.prove_guidance import prove_guidance
 from slviewer.validation.prove_hostile import prove_hostile
 from slviewer.validation.prove_registration import prove_registration
 from slviewer.validation.prove_uncertainty import prove_uncertainty
 
-Claim = Literal["accuracy", "causes", "guidance", "hostile", "registration", "uncertainty"]
+Claim = Literal["accuracy", "causes", "edges", "guidance", "hostile", "registration", "uncertainty"]
 CLAIMS: Mapping[Claim, tuple[str, Callable[..., Proof]]] = {
     "accuracy": ("accuracy at the noise floor", prove_accuracy),
     "causes": ("faults called by their names", prove_causes),
+    "edges": ("printed edges without ridges", prove_edges),
     "guidance": ("guided poses", prove_guidance),
     "hostile": ("captures of a hostile rig", prove_hostile),
     "registration": ("scans in one frame", prove_registration),
@@ -66,9 +68,9 @@ def prove(
 
     Args:
         quick: A quarter of the camera's resolution; its figures are its own.
-        only: What to prove: accuracy on planes and spheres, causes of bad calibrations, guidance of an operator to
-            good poses, captures of a hostile rig, registration of scans, uncertainty against true errors; by default
-            all.
+        only: What to prove: accuracy on planes and spheres, causes of bad calibrations, printed edges, guidance of an
+            operator to good poses, captures of a hostile rig, registration of scans, uncertainty against true errors;
+            by default all.
         cases: Of the hostile rig only these faults, such as flicker, jpeg:mild or gamma:severe:scan.
         seed: Another seed proves it on other rigs of the same kinds.
     """

@@ -46,7 +46,7 @@ def test_all_claims_are_proved_and_one_that_fails_is_named(asked, tmp_path, caps
     assert main(["prove", "--json", str(out)]) == 1
     said = capsys.readouterr()
     assert asked == {claim: (0.5 if claim == "hostile" else 1.0, 0) for claim in prove.CLAIMS}
-    assert said.out.count("a table") == 6 and said.out.count("pass  ") == 5
+    assert said.out.count("a table") == len(prove.CLAIMS) == said.out.count("pass  ") + 1
     assert "FAIL" in said.out and "causes" in said.err
     assert {claim: proof["holds"] for claim, proof in json.loads(out.read_text()).items()} == {
         "accuracy": True,

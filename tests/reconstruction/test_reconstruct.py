@@ -47,6 +47,9 @@ class FakePhase:
     axis: str
     offset: np.ndarray
 
+    def correct_edges(self) -> tuple["FakePhase", np.ndarray]:
+        return self, self.edge_error_px
+
 
 def phases(*axes: str) -> dict:
     return {axis: FakePhase(axis, np.zeros(SHAPE)) for axis in axes}

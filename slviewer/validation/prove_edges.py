@@ -1,0 +1,140 @@
+"""Proof that printed edges leave no ridges: a printed plane measured through lenses of different blur, and the edges of
+an object, which must not suffer."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from slviewer.evaluation.render import Row
+from slviewer.fringe.phase import PhaseMap
+from slviewer.pipeline.feedback import Progress, ignore_progress
+from slviewer.reconstruction.reconstruct import normals, reconstruct
+from slviewer.simulation.boards import BoardScene, Pose, printed_board
+from slviewer.simulation.mesh import demo_object
+from slviewer.simulation.plans import rotation
+from slviewer.simulation.renderer import Renderer
+from slviewer.simulation.rig import SimulatedRig, letter
+from slviewer.simulation.truth import PerfectModel
+from slviewer.target.board import Board
+from slviewer.validation.proof import BandCheck, Proof, prove_checks
+from slviewer.validation.rendered_calibration import render_phase
+
+PRINT = "chessboard:7x5:32"
+BLURS_PX = (0.6, 1.2, 2.0)
+"""Standard deviations of the camera's point spread."""
+MAX_BLUR_SHARE = 3.0
+"""px at full scale: fringes are narrower at a smaller one, and a wider blur mixes too many of their slopes."""
+LOWER = 3.0
+"""By this factor, at least, a ridge is lower than without the correction."""
+TILT = np.array([0.25, 0.2, 0.1])
+DEPTH_MM = 600.0
+_REACH_PX = 12
+_BINS_PX = 0.5
+_NEAR_PX = 3
+
+
+def prove_edges(scale: float = 1.0, *, seed: int = 0, progress: Progress = ignore_progress) -> Proof:
+    """Measure the ridges of a printed plane and the edges of the demo object, with and without the correction."""
+    rows: list[Row] = []
+    checks: list[BandCheck] = []
+    blurs = [blur for blur in BLURS_PX if blur <= MAX_BLUR_SHARE * scale]
+    for i, blur in enumerate(blurs):
+        progress(i / len(blurs), f"blur {blur:g} px")
+        rig = letter(scale, seed)
+        rig = replace(rig, sensor=replace(rig.sensor, psf_px=blur / scale))
+        before, after = (1e3 * ridge for ridge in measure_ridges(rig, seed))
+        name = f"blur {blur:g} px"
+        rows.append(_row(f"printed plane, {name}", before, after))
+        checks.append(BandCheck(name, "ridge's factor", before / after, LOWER, 100.0))
+        before, after = (1e3 * rms for rms in measure_object_edges(rig, seed))
+        rows.append(_row(f"object's edges, {name}", before, after))
+        checks.append(BandCheck(name, "factor at an object's edges", before / after, 0.98, 100.0))
+    above = [
+        "Peak to valley of the mean depth error across the edges of a print, and RMS depth error within "
+        f"{_NEAR_PX} px of an object's creases and depth jumps, by the true lenses.",
+        "",
+    ]
+    return prove_checks(checks, scale, rows, {"rows": rows}, above=above)
+
+
+def _row(scene: str, before: float, after: float) -> Row:
+    """A table row of an error without and with the correction."""
+    return {"scene": scene, "without, µm": before, "with, µm": after, "ratio": before / after}
+
+
+def measure_ridges(rig: SimulatedRig, seed: int = 0) -> tuple[float, float]:
+    """Peak to valley, mm, of the mean depth error across the printed edges of a plane: as decoded, and corrected."""
+    board = Board.parse(PRINT)
+    R = rotation(TILT)
+    middle = (board.points.min(axis=0) + board.points.max(axis=0)) / 2
+    scene = printed_board(board, Pose(R, np.array([0.0, 0.0, DEPTH_MM]) - R @ middle))
+    renderer = Renderer(rig, scene)
+    phase = render_phase(renderer, "print", seed)
+    before, after = _measure_depth_errors(rig, phase, renderer.truth().points[..., 2])
+    distance, side = _signed_distance(rig, scene)
+    return _measure_ridge(before, distance, side), _measure_ridge(after, distance, side)
+
+
+def measure_object_edges(rig: SimulatedRig, seed: int = 0) -> tuple[float, float]:
+    """RMS depth error, mm, near the creases and depth jumps of the demo object, of the points that are in both clouds:
+    as decoded, and corrected."""
+    scene = demo_object(Pose(np.eye(3), np.array([0.0, 0.0, DEPTH_MM])))
+    renderer = Renderer(rig, scene)
+    truth = renderer.truth().points
+    before, after = _measure_depth_errors(rig, render_phase(renderer, "object", seed), truth[..., 2])
+    near = _find_creases(truth) & np.isfinite(before) & np.isfinite(after)
+    return tuple(float(np.sqrt(np.mean(np.minimum(np.abs(each[near]), 1.0) ** 2))) for each in (before, after))  # type: ignore[return-value]
+
+
+def _measure_depth_errors(rig: SimulatedRig, phase: PhaseMap, true_z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Depth errors (h, w) mm of the phase as decoded, and of the cloud that the program makes of it."""
+    model = PerfectModel(rig)
+    return model.points(phase)[..., 2] - true_z, reconstruct(model, {"x": phase}).points[..., 2] - true_z
+
+
+def _signed_distance(rig: SimulatedRig, scene: BoardScene) -> tuple[np.ndarray, np.ndarray]:
+    """Distance (h, w) px along the rows from the nearest printed edge, positive on its right, NaN where another edge is
+    near or the plate ends; and whether that edge is bright on its right."""
+    width, height = rig.camera.size
+    albedo = scene.trace(rig.camera.rays()).albedo
+    over = albedo - (scene.white + scene.dark) / 2
+    distance, side = np.full((height, width), np.nan), np.zeros((height, width), bool)
+    on_plate = albedo > 0
+    for v in range(height):
+        crossings = np.flatnonzero((over[v, :-1] < 0) != (over[v, 1:] < 0))
+        places = crossings + over[v, crossings] / (over[v, crossings] - over[v, crossings + 1])
+        for i, place in enumerate(places):
+            first, last = int(place) - _REACH_PX, int(place) + _REACH_PX + 2
+            lonely = (i == 0 or place - places[i - 1] > 2 * _REACH_PX) and (
+                i == len(places) - 1 or places[i + 1] - place > 2 * _REACH_PX
+            )
+            if lonely and first >= 0 and last <= width and on_plate[v, first:last].all():
+                distance[v, first:last] = np.arange(first, last) - place
+                side[v, first:last] = over[v, crossings[i] + 1] > 0
+    return distance, side
+
+
+def _measure_ridge(error: np.ndarray, distance: np.ndarray, side: np.ndarray) -> float:
+    """Peak to valley of the mean error by distance from the edges, those bright on the right and on the left apart."""
+    known = np.isfinite(error) & np.isfinite(distance)
+    profile = []
+    for is_right in (True, False):
+        here = known & (side == is_right)
+        bins = np.floor(distance[here] / _BINS_PX).astype(int) + round((_REACH_PX + 1) / _BINS_PX)
+        count = np.bincount(bins)
+        with np.errstate(invalid="ignore"):
+            mean = np.bincount(bins, error[here]) / count
+        profile.append(mean[count > 0.2 * np.median(count[count > 0])])
+    return float(np.ptp(np.concatenate(profile)))
+
+
+def _find_creases(points: np.ndarray) -> np.ndarray:
+    """Return the pixels (h, w) bool within `_NEAR_PX` of a depth jump, a silhouette or a crease of the true surface."""
+    import cv2
+
+    normal = np.nan_to_num(normals(points.astype(np.float32), 1))
+    turn = np.zeros(points.shape[:2], np.uint8)
+    for axis in (0, 1):
+        cosine = np.sum(normal * np.roll(normal, 2, axis=axis), axis=2)
+        turn |= (cosine < 0.9).astype(np.uint8)
+    return cv2.dilate(turn, np.ones((2 * _NEAR_PX + 1,) * 2, np.uint8)).astype(bool)
