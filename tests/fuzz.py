@@ -208,7 +208,7 @@ def damage_array(path: Path, rng: random.Random) -> None:
     """Replace a .npy file by another array, or a damaged one."""
     array = np.load(path)
     others = (
-        array.ravel()[:-1], array.astype(np.float64) * np.nan, np.zeros(0), np.zeros((3, 4)), array[None],
+        array.ravel()[:-1], np.full(array.shape, np.nan), np.zeros(0), np.zeros((3, 4)), array[None],
         np.float64(1),
         np.array(["x", "y"]), np.full(array.shape, 1e308), np.zeros(array.shape, bool),
     )  # fmt: skip

@@ -149,8 +149,10 @@ def measure_held_out(
     models: Mapping[str, Model], observation: Observation, axis: Axis, rig: StereoRig
 ) -> dict[str, HeldOutPose]:
     """Measure the errors of each model on a pose, all from the same axis and over the pixels and features that all of
-    them measure; empty where these are too few. ``rig`` converts millimetres to pixels."""
-    phase = smoothed_phases(observation)[axis]
+    them measure; empty where these are too few, or the pose lacks the axis. ``rig`` converts millimetres to pixels."""
+    phase = smoothed_phases(observation).get(axis)
+    if phase is None:
+        return {}
     clouds = {name: np.asarray(model.points(phase)) for name, model in models.items()}
     common = np.logical_and.reduce([np.isfinite(points[..., 2]) for points in clouds.values()])
     features = {
