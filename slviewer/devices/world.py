@@ -10,6 +10,7 @@ import numpy as np
 from slviewer.errors import InputError
 from slviewer.fringe.sequence import Axis
 from slviewer.simulation.boards import FLAT, BoardScene, BoardShape, Pose, blank_board, printed_board
+from slviewer.simulation.decals import MarkedScene, marked_plate
 from slviewer.simulation.mesh import MeshScene, demo_object
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import SimulatedRig
@@ -17,10 +18,11 @@ from slviewer.simulation.scenes import Scene, Spheres, sphere
 from slviewer.simulation.turning import turn_pose, turning
 from slviewer.target.board import Board
 
-Thing = Literal["board", "plane", "sphere", "object", "stone"]
-"""The printed target, the blank plate, the Letter's sphere, the demo object, the stone on the turntable."""
+Thing = Literal["board", "plane", "sphere", "object", "stone", "marked"]
+"""The printed target, the blank plate, the Letter's sphere, the demo object, the stone on the turntable, a plate with
+coded markers."""
 
-_INITIAL_DEPTHS_MM = {"board": 600.0, "plane": 600.0, "sphere": 690.0, "object": 600.0}
+_INITIAL_DEPTHS_MM = {"board": 600.0, "plane": 600.0, "sphere": 690.0, "object": 600.0, "marked": 600.0}
 _SETTLED_S = 0.3  # a thing that has not been moved for so long is rendered in full by a preview too
 _DRAFT_SCALE = 0.25  # of a preview while things move: the geometry of 400x300 rays instead of 1600x1200
 
@@ -168,7 +170,7 @@ def _get_pose(scene: Scene) -> Pose:
     """Return the T_camera_thing of a scene; identity rotation for a sphere."""
     if isinstance(scene, Spheres):
         return Pose(np.eye(3), scene.centres[0])
-    assert isinstance(scene, BoardScene | MeshScene)
+    assert isinstance(scene, BoardScene | MeshScene | MarkedScene)
     return scene.pose
 
 
@@ -176,12 +178,16 @@ def _move_scene(scene: Scene, pose: Pose) -> Scene:
     """Return a scene moved to another pose; of a sphere only the centre moves."""
     if isinstance(scene, Spheres):
         return replace(scene, centres=pose.t[None].astype(float))
+    if isinstance(scene, MarkedScene):
+        return replace(scene, scene=_move_scene(scene.scene, pose), pose=pose)
     assert isinstance(scene, BoardScene | MeshScene)
     return replace(scene, pose=pose)
 
 
 def _make_scene(thing: Thing) -> Scene:
-    """Return the scene of the demo object, or of the stone on the turntable, at its initial pose."""
+    """Return the scene of a thing that is made when it is first placed, at its initial pose."""
+    if thing == "marked":
+        return marked_plate(_make_initial_pose(thing))
     return demo_object(_make_initial_pose(thing)) if thing == "object" else turning(1)["turn_01"]
 
 

@@ -26,6 +26,12 @@ def merge_html(merge: MergeView, labels: Mapping[str, str]) -> Html:
         parts.append(_letter_html(merge))
     if merge.loops:
         parts.append(_loops_table(merge.loops, labels))
+    if merge.markers:
+        common = "; ".join(
+            f"{_get_label(scan, labels)} → {_get_label(onto, labels)} {count}, {rms_mm:.3f} mm"
+            for scan, onto, count, rms_mm in merge.markers
+        )
+        parts.append(paragraph(coloured(f"Common markers, and RMS distance of their corners: {common}.", "dim")))
     parts += [alert(use_labels(why, labels), "warning") for why in merge.dropped]
     if merge.refused:
         pairs = "".join(f"<li>{to_html(use_labels(why, labels))}</li>" for why in merge.refused)

@@ -1,7 +1,7 @@
 """Registering scans of one object, and fusing them into one surface."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,6 +17,7 @@ from slviewer.pipeline.models import ModelName, check_accepted, frame_of, load_m
 from slviewer.pipeline.open_session import SessionLike, next_number, opened
 from slviewer.pipeline.scale import describe_scale, scale_factor
 from slviewer.reconstruction.cloud import Cloud
+from slviewer.registration.markers import MeasuredMarkers, marker_notes, measure_markers
 from slviewer.registration.multiway import Alignment, Pair, Starts
 from slviewer.registration.pairwise import Registration
 from slviewer.registration.picked import fit_picked_start
@@ -28,7 +29,7 @@ from slviewer.surface.fuse import Fused, fuse
 
 MAX_CONTRADICTION_SHARE = 0.01
 """Share of contradicting points from which on a pair is warned about: noise alone has fewer than one in a million."""
-StartKind = Literal["features", "turntable", "identity", "placed"]
+StartKind = Literal["features", "turntable", "identity", "placed", "markers"]
 Picked = Mapping[Pair, tuple[np.ndarray, np.ndarray]]
 """Of a pair (scan, onto): three or more points (n, 3) mm on either, in their cameras' frames."""
 
@@ -84,6 +85,10 @@ class Merge:
             ],
             "dropped": [{"scan": a, "onto": b, "why": why} for (a, b), why in alignment.dropped.items()],
             "refused": [{"scan": a, "onto": b, "why": why} for (a, b), why in alignment.refused.items()],
+            "markers": [
+                {"scan": a, "onto": b, "ids": list(pose.ids), "moved": list(pose.moved), "rms_mm": pose.rms_mm}
+                for (a, b), pose in alignment.markers.items()
+            ],
             "static_points": dict(self.static_points),
             "contradictions": [
                 {
@@ -110,6 +115,10 @@ class Merge:
             f"overlap {100 * pair.overlap:.0f} %, standard deviations {1000 * pair.uncertainty.shift_mm:.1f} um "
             f"and {pair.uncertainty.turn_deg:.4f} degrees"
             for (a, b), pair in alignment.pairs.items()
+        ]
+        lines += [
+            f"{a} -> {b}: {len(pose.ids)} common markers, their corners {pose.rms_mm:.3f} mm apart (RMS)"
+            for (a, b), pose in alignment.markers.items()
         ]
         lines.append(f"(The Letter's three depths: point to point {r1:.2f} and {r2:.2f} mm.)")
         if alignment.loops:
@@ -169,7 +178,9 @@ def merge(
         out: PLY file. Without it the session stores the merge as merge/1 and so on, for mesh, compare, measure and
             export, and its file is in the session's exports.
         start: Initial alignment: features estimates it from the scans; turntable uses the angles of the turntable;
-            identity assumes that the scans are nearly aligned already; placed takes the places that `align` found.
+            identity assumes that the scans are nearly aligned already; placed takes the places that `align` found;
+            markers takes coded markers (`slviewer target markers:0-23:20`) that the scans show, which also hold what
+            the shape leaves open.
         angle: Degrees that the turntable turns from each capture to the next, with --start turntable; by default as
             stored with the captures of `slviewer turn`.
         model: Which calibration to use; by default the best one available.
@@ -216,9 +227,15 @@ def merge(
                 accept_rejected=accept_rejected,
                 warn=warn,
             )
+        if start == "markers":
+            starts = replace(starts, markers=_measure_markers(clouds, warn))
         registered = register_object(clouds, reference, starts, stage(progress, 0.4, 0.75, "registering"))
         alignment = registered.alignment
-        for why in [*alignment.dropped.values(), *_scene_warnings(clouds, registered, keep_background)]:
+        for why in [
+            *_list_moved_markers(alignment),
+            *alignment.dropped.values(),
+            *_scene_warnings(clouds, registered, keep_background),
+        ]:
             warn(why)
         clouds = clouds if keep_background else dict(registered.clouds)
         fused = fuse(clouds, alignment.T_reference_scan, stage(progress, 0.75, 0.9, "fusing"))
@@ -239,6 +256,32 @@ def merge(
             store.save_result(result.result_name, merge_record(store, result, fitted.name), {})
     progress(1.0, "merged")
     return result
+
+
+def _measure_markers(clouds: Mapping[str, Cloud], warn: Warn) -> dict[str, MeasuredMarkers]:
+    """Measure the coded markers on the scans; raises InputError where no two scans show the same one."""
+    measured = {name: measure_markers(cloud) for name, cloud in clouds.items()}
+    for note in marker_notes(measured):
+        warn(note)
+    numbers = [set(markers.ids.tolist()) for markers in measured.values()]
+    if not any(one & other for i, one in enumerate(numbers) for other in numbers[:i]):
+        counts = ", ".join(f"{name} {len(markers.ids)}" for name, markers in measured.items())
+        raise InputError(
+            f"no two scans show the same marker (measured: {counts}): print some by `slviewer target markers:0-23:20`, "
+            "put them on or beside the object so that neighbouring scans share three or more, and scan again; or start "
+            "from features"
+        )
+    return measured
+
+
+def _list_moved_markers(alignment: Alignment) -> list[str]:
+    """A sentence for each pair between whose scans markers have moved."""
+    return [
+        f"{a} -> {b}: marker {', '.join(map(str, pose.moved))} has moved between the scans, and is ignored: "
+        "glue it on, or take it away"
+        for (a, b), pose in alignment.markers.items()
+        if pose.moved
+    ]
 
 
 def _load_places(store: Session, names: Sequence[str]) -> dict[str, np.ndarray]:

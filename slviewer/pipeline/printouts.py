@@ -7,7 +7,8 @@ from slviewer.fringe.presets import PRESETS
 from slviewer.fringe.sequence import parse_size
 from slviewer.session.exporters import write_pattern_folder
 from slviewer.target.board import Board
-from slviewer.target.sheet import write_sheet
+from slviewer.target.coded import draw_marker_sheet
+from slviewer.target.sheet import write_drawing, write_sheet
 
 
 def patterns(preset: str, projector: str, out: Path | str) -> str:
@@ -31,10 +32,14 @@ def target(board: str, out: Path | str) -> str:
     """Draw a printable target to exact scale.
 
     Args:
-        board: circles:21x16:9, acircles:..., chessboard:9x7:75 or charuco:....
+        board: circles:21x16:9, acircles:..., chessboard:9x7:75 or charuco:...; or coded markers for merging:
+            markers:0-23:20 (numbers to cut out, mm) or mat:16 (a mat for a turntable, mm).
         out: A .pdf or .svg file.
 
     Returns what to do with it, in words.
     """
-    write_sheet(Board.parse(board), Path(out))
+    if board.partition(":")[0] in ("markers", "mat"):
+        write_drawing(draw_marker_sheet(board), Path(out))
+    else:
+        write_sheet(Board.parse(board), Path(out))
     return f"{board} drawn to {out}: print at 100 %, and measure it"

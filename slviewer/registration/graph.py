@@ -11,7 +11,7 @@ from scipy.sparse.csgraph import dijkstra
 from scipy.spatial.transform import Rotation
 
 from slviewer.geometry.rigid import move_points, rigid_transform
-from slviewer.registration.refine import Uncertainty
+from slviewer.registration.uncertainty import Uncertainty
 
 _FLOOR_MM, _FLOOR_DEG = 0.003, 0.002
 """Least standard deviation of an edge, however many points it has."""

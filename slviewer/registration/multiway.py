@@ -8,7 +8,7 @@ are registered, which close loops. Pairs that contradict the others are dropped;
 import os
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from threading import Lock
 from typing import TypeVar
@@ -21,13 +21,14 @@ from slviewer.reconstruction.cloud import Cloud
 from slviewer.registration import graph
 from slviewer.registration.consistency import select_consistent_edges
 from slviewer.registration.graph import Edge, LoopGap
+from slviewer.registration.markers import MarkerPose, MeasuredMarkers, fit_marker_pose
 from slviewer.registration.pairwise import Progress, Registration, register_prepared, search_starts
 from slviewer.registration.prepared import LEAST_POINTS, PreparedScan, prepare_scan
-from slviewer.registration.refine import Uncertainty
 from slviewer.registration.refusal import Refused
 from slviewer.registration.scan import Scan
 from slviewer.registration.start import Candidate, Start
 from slviewer.registration.turntable import TurntableAxis, determines_axis, fit_turntable_axis, shortest_turn
+from slviewer.registration.uncertainty import Uncertainty
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -39,6 +40,8 @@ ALL_PAIRS = 4
 """Up to this number of scans, every pair is registered."""
 _LOOP_PAIRS = 2
 """Largest number of loop-closing pairs per scan."""
+_MARKER_PAIRS = 3
+"""Pairs with common markers that are registered for each of many scans."""
 _LOOP_OVERLAP = 0.3
 """Least predicted overlap of a loop-closing pair."""
 
@@ -49,13 +52,15 @@ class Starts:
 
     ``poses``: approximate T_world_scan (4, 4) mm by name, in any common frame. ``table_deg``: the angle of a
     turntable by name, of some of the scans at least; ``axis``: its axis, None to estimate it from the first pairs.
-    ``picked``: initial poses from picked points, by pair.
+    ``picked``: initial poses from picked points, by pair. ``markers``: coded markers by name, which give initial poses
+    and constrain the registration.
     """
 
     poses: Mapping[str, np.ndarray] | None = None
     table_deg: Mapping[str, float] | None = None
     axis: TurntableAxis | None = None
     picked: Mapping[Pair, Candidate] | None = None
+    markers: Mapping[str, MeasuredMarkers] | None = None
 
 
 @dataclass(frozen=True)
@@ -76,7 +81,8 @@ class Alignment:
 
     ``T_reference_scan`` (4, 4) mm by name, into the frame of ``reference``, with ``uncertainties``. ``pairs``: the
     registrations from which it was computed; ``loops`` of them, the one with the largest gap first. ``dropped``: pairs
-    that the others contradict; ``refused``: pairs that could not be registered; each with the reason.
+    that the others contradict; ``refused``: pairs that could not be registered; each with the reason. ``markers``: of
+    pairs with common ones, the pose that they alone determine.
     """
 
     reference: str
@@ -86,6 +92,7 @@ class Alignment:
     loops: tuple[Loop, ...]
     dropped: Mapping[Pair, str]
     refused: Mapping[Pair, str]
+    markers: Mapping[Pair, MarkerPose] = field(default_factory=dict)
 
     def on_reference(self) -> dict[str, Registration]:
         """Return a registration onto the reference for every other scan, with its optimised pose and uncertainty.
@@ -147,6 +154,7 @@ class _PoseGraphBuilder:
         self._report(0.0)
         self.scans = _map_parallel(self._prepare, list(scans.items()))
         self.size = min(scan.size for scan in self.scans)
+        self.markers = self._fit_markers()
         self.expected = len(self._list_first_pairs()) + (_LOOP_PAIRS * len(scans) if len(scans) > ALL_PAIRS else 0)
 
     def build(self) -> Alignment:
@@ -164,8 +172,11 @@ class _PoseGraphBuilder:
     # selection of pairs and of their initial poses
 
     def _list_first_pairs(self) -> list[Pair]:
-        """List every pair of a few scans, or each scan with the one before it and the last with the first."""
+        """List every pair of a few scans, or each scan with the one before it and the last with the first; with markers
+        those pairs that show the same ones."""
         names = self.names
+        if self.starts.markers is not None:
+            return list(self.markers)
         if len(names) <= ALL_PAIRS:
             pairs = [(a, b) for i, a in enumerate(names) for b in names[:i]]
         else:
@@ -200,6 +211,31 @@ class _PoseGraphBuilder:
             raise Refused("overlap", "No two scans in a row register, so that the turntable's axis cannot be found: "
                           "give the axis, or scan at smaller steps.")  # fmt: skip
         return fit_turntable_axis(steps, steps_deg)
+
+    def _fit_markers(self) -> dict[Pair, MarkerPose]:
+        """Fit the poses of pairs with common markers: of a few scans all, of many each scan's `_MARKER_PAIRS` best."""
+        poses: dict[Pair, MarkerPose] = {}
+        seen = self.starts.markers or {}
+        for i, a in enumerate(self.names):
+            for b in self.names[:i]:
+                if a not in seen or b not in seen:
+                    continue
+                pair = (b, a) if a == self.reference else (a, b)
+                try:
+                    pose = fit_marker_pose(seen[pair[0]], seen[pair[1]])
+                except Refused as error:
+                    self.refused[pair] = error
+                    continue
+                if pose is not None:
+                    poses[pair] = pose
+        if len(self.names) <= ALL_PAIRS:
+            return poses
+        count, chosen = dict.fromkeys(self.names, 0), {}
+        for (a, b), pose in sorted(poses.items(), key=lambda item: -len(item[1].ids)):
+            if min(count[a], count[b]) < _MARKER_PAIRS:
+                count[a], count[b] = count[a] + 1, count[b] + 1
+                chosen[a, b] = pose
+        return chosen
 
     def _relative_pose(self, known: Mapping[str, tuple[np.ndarray, Start]], scan: str, onto: str) -> Candidate | None:
         """Return the initial pose of a pair from poses in a common frame; None where one of them is not known."""
@@ -296,6 +332,7 @@ class _PoseGraphBuilder:
                 size=self.size,
                 initial=start,
                 starts=starts,
+                markers=self.markers.get(pair),
                 progress=lambda share: self._report(before + step * share),
             )
         except Refused as error:
@@ -362,13 +399,18 @@ class _PoseGraphBuilder:
             tuple(sorted(loops, key=lambda loop: -loop.before.shift_mm)),
             dropped,
             {pair: str(error) for pair, error in self.refused.items()},
+            self.markers,
         )
 
     def _is_good_fit(self, edge: Edge, T: np.ndarray) -> bool:
         """Whether ICP of an edge's scans from the pose ``T`` (4, 4) succeeds and stays within its gate."""
         try:
             result = register_prepared(
-                self.scans[edge.scan], self.scans[edge.onto], size=self.size, initial=Candidate(T, "initial")
+                self.scans[edge.scan],
+                self.scans[edge.onto],
+                size=self.size,
+                initial=Candidate(T, "initial"),
+                markers=self.markers.get((self.names[edge.scan], self.names[edge.onto])),
             )
         except Refused:
             return False

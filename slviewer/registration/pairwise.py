@@ -6,17 +6,19 @@ sphere), and no other pose fits as well.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from slviewer.errors import InputError
 from slviewer.registration.freedom import WORDS, Freedom, estimate_freedom
+from slviewer.registration.markers import MOVED_MM, MarkerPose
 from slviewer.registration.open3d_loader import align_icp, open3d
 from slviewer.registration.prepared import PreparedScan, prepare_scan, scale_of
-from slviewer.registration.refine import Uncertainty, refine_pose
+from slviewer.registration.refine import refine_pose
 from slviewer.registration.refusal import Refused
 from slviewer.registration.start import SEARCHED, Candidate, Start, pose_distance, rank_starts
+from slviewer.registration.uncertainty import Uncertainty
 
 Progress = Callable[[float], None]
 
@@ -27,6 +29,10 @@ LEAST_OVERLAP = 0.15
 LEAST_AGREEMENT = 0.8
 MOST_ATTEMPTS = 3
 MOST_SLACK = 1 / 30  # of the object's size
+LEAST_MARKERS = 2
+"""In common, without overlap: of one alone nobody could tell that it was moved."""
+MOST_MARKER_ERROR = 1 / 300
+"""Of the object's size: what markers alone may leave open at its rim (1 sigma)."""
 RIVAL_SCORE, RIVAL_OVERLAP, RIVAL_RMS = 0.7, 0.6, 1.25
 """A rival comes to so much of the best pose's score and overlap, and to at most so many times its RMS."""
 _STATISTICS_POINTS = 50_000
@@ -93,15 +99,20 @@ def register_prepared(
     size: float | None = None,
     initial: np.ndarray | Candidate | None = None,
     starts: list[Candidate] | None = None,
+    markers: MarkerPose | None = None,
     progress: Progress | None = None,
 ) -> Registration:
     """Register prepared scans; see ``register``.
 
     ``size``: of the object in mm, by default that of the smaller scan. ``starts``: result of an earlier
-    ``search_starts``, which is run otherwise.
+    ``search_starts``, which is run otherwise. ``markers``: those that both scans show, from whose pose it starts, and
+    which hold what the shape leaves open; alone, where the surfaces do not overlap.
     """
     report = progress or (lambda share: None)
     size = min(scan.size, reference.size) if size is None else size
+    if markers is not None:
+        report(0.4)
+        return _register_by_markers(scan, reference, markers, size)
     if starts is None:
         starts = search_starts(scan, reference, size, initial)
     refusal: Refused | None = None
@@ -133,18 +144,47 @@ def search_starts(
     return rank_starts(scan, reference, float(f"{coarse:.3g}"), initial)
 
 
-def _refine_start(scan: PreparedScan, reference: PreparedScan, start: Candidate, size: float) -> Registration:
+def _register_by_markers(scan: PreparedScan, reference: PreparedScan, markers: MarkerPose, size: float) -> Registration:
+    """Register scans from the pose of their common markers: by surfaces and markers where the surfaces overlap, else by
+    the markers alone. Raises ``Refused`` where the surfaces contradict them, and where they do not determine the pose.
+    """
+    try:
+        return _refine_start(scan, reference, Candidate(markers.T, "markers"), size, markers)
+    except Refused as refusal:
+        if refusal.reason != "overlap":
+            raise
+    uncertainty = markers.uncertainty
+    error = float(np.hypot(uncertainty.shift_mm, np.radians(uncertainty.turn_deg) * size / 2))
+    if len(markers.ids) < LEAST_MARKERS or not error <= MOST_MARKER_ERROR * size:
+        raise Refused(
+            "overlap",
+            f"The scans hardly overlap, and the markers that both show ({len(markers.ids)}) leave {error:.2g} mm open: "
+            "let both see three markers or more, well apart.",
+        )
+    gate = max(MOVED_MM, 2.0 * reference.spacing)
+    figures, _ = _compute_figures(scan, reference, markers.T, gate, uncertainty, "markers")
+    return replace(figures, rms_mm=markers.rms_mm, inlier_rmse_mm=markers.rms_mm, agreement=1.0, slack_mm=error)
+
+
+def _refine_start(
+    scan: PreparedScan,
+    reference: PreparedScan,
+    start: Candidate,
+    size: float,
+    markers: MarkerPose | None = None,
+) -> Registration:
     """Run ICP from an initial pose, and compute its figures; raises ``Refused`` where the result is not reliable."""
     scale = scale_of(size)
     T = start.T
     for voxel, gate in LEVELS_MM:
         widest = max(gate * scale, 2.0 * max(scan.spacing, reference.spacing), 3.0 * _pair_noise(scan, reference))
-        loss = open3d().pipelines.registration.TukeyLoss(0.5 * widest)
-        T = align_icp(scan.thinned(voxel * scale), reference.thinned(voxel * scale), T, widest, loss, 1e-6, 40)
+        if markers is None:  # else it starts within a fraction of a millimetre, and a plane would slide
+            loss = open3d().pipelines.registration.TukeyLoss(0.5 * widest)
+            T = align_icp(scan.thinned(voxel * scale), reference.thinned(voxel * scale), T, widest, loss, 1e-6, 40)
     narrowest = max(LAST_GATE_MM * min(1.0, scale), 3.0 * _pair_noise(scan, reference))
-    end = refine_pose(scan, reference, T, widest, narrowest)
+    end = refine_pose(scan, reference, T, widest, narrowest, markers)
     result, held = _compute_figures(scan, reference, end.T, end.gate_mm, end.uncertainty, start.start)
-    _refuse_if_doubtful(result, held, size)
+    _refuse_if_doubtful(result, None if markers is not None else held, size)
     return result
 
 
@@ -196,8 +236,11 @@ def _rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.square(values)))) if values.size else float("nan")
 
 
-def _refuse_if_doubtful(result: Registration, held: Freedom, size: float) -> None:
-    """Raise ``Refused`` for too small an overlap or agreement, or a shape that leaves the pose undetermined."""
+def _refuse_if_doubtful(result: Registration, held: Freedom | None, size: float) -> None:
+    """Raise ``Refused`` for too small an overlap or agreement, or a shape that leaves the pose undetermined.
+
+    ``held``: None where markers determine the pose.
+    """
     if not result.overlap >= LEAST_OVERLAP:
         raise Refused(
             "overlap",
@@ -211,13 +254,13 @@ def _refuse_if_doubtful(result: Registration, held: Freedom, size: float) -> Non
             f"{100 * result.agreement:.0f} % of the points come within {result.gate_mm:.2g} mm; check that both show "
             "the same object, and that it did not change between the scans.",
         )
-    shape = held.shape(MOST_SLACK * size)
+    shape = None if held is None else held.shape(MOST_SLACK * size)
     if shape is not None or not np.isfinite(result.uncertainty.shift_mm):
         shape = shape or "plane"
         raise Refused(
             shape,
             f"The surface that the two scans share {WORDS[shape]}, so that nothing holds the pose: let them share "
-            "edges, corners or bumps too, or put something with relief beside the object.",
+            "edges, corners or bumps too, or put coded markers on it or beside it, and start from markers.",
         )
 
 

@@ -13,7 +13,9 @@ import numpy as np
 from slviewer.geometry.cubes import occupied_cubes
 from slviewer.geometry.rigid import move_points, turn_about
 from slviewer.geometry.robust import robust_sigma, tukey_weights
+from slviewer.registration.markers import MarkerPose
 from slviewer.registration.prepared import PreparedScan
+from slviewer.registration.uncertainty import Uncertainty
 
 _STEPS = 12
 _SETTLED_MM, _NEAR_MM = 2e-3, 5e-3
@@ -23,30 +25,10 @@ _MIN_PAIRS = 60
 _PATCHES = (16.0, 9.0, 5.0)
 """Diameter of the overlap over the side of a patch: coarser patches include errors of longer correlation length."""
 _LEAST_PATCHES = 20
+_INDEPENDENT = 100
+"""Number of independent measurements that a surface counts as, beside markers."""
 _UNSEEN = 1.25
 """Ratio of true to estimated sigma on simulated scans: residuals do not show that pairs change with the pose."""
-
-
-@dataclass(frozen=True, eq=False)
-class Uncertainty:
-    """Uncertainty of a registered pose (1 sigma).
-
-    ``covariance`` (6, 6): of a small rotation vector (rad) about ``centre`` (3,) mm, the middle of the overlap in the
-    reference's frame, and of the translation (mm) there.
-    """
-
-    covariance: np.ndarray
-    centre: np.ndarray
-
-    @property
-    def shift_mm(self) -> float:
-        """Root of the expected squared translation of the overlap's middle."""
-        return float(np.sqrt(np.trace(self.covariance[3:, 3:])))
-
-    @property
-    def turn_deg(self) -> float:
-        """Root of the expected squared rotation angle."""
-        return float(np.degrees(np.sqrt(np.trace(self.covariance[:3, :3]))))
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,9 +44,14 @@ class RefinedPose:
 
 
 def refine_pose(
-    scan: PreparedScan, reference: PreparedScan, T: np.ndarray, widest: float, narrowest: float
+    scan: PreparedScan,
+    reference: PreparedScan,
+    T: np.ndarray,
+    widest: float,
+    narrowest: float,
+    markers: MarkerPose | None = None,
 ) -> RefinedPose:
-    """Refine a pose ``T`` (4, 4) by symmetric point-to-plane ICP on the thinned clouds.
+    """Refine a pose ``T`` (4, 4) by symmetric point-to-plane ICP on the thinned clouds, and by the corners of markers.
 
     The gate decreases from ``widest`` mm to three times the residuals' noise, not below ``narrowest`` mm. With too few
     pairs the current pose is returned with the uncertainty None.
@@ -79,7 +66,11 @@ def refine_pose(
         centre = points.mean(axis=0)
         sigma = max(robust_sigma(residual, about=0.0), 1e-6)
         J, weight = _jacobian(points - centre, normal), tukey_weights(residual, sigma)
-        step = -np.linalg.lstsq((J * weight[:, None]).T @ J, J.T @ (weight * residual), rcond=1e-10)[0]
+        H, gradient = (J * weight[:, None]).T @ J, J.T @ (weight * residual)
+        if markers is not None:
+            H_markers, gradient_markers = markers.normal_equations(T, centre, sigma * np.sqrt(_count_alike(points)))
+            H, gradient = H + H_markers, gradient + gradient_markers
+        step = -np.linalg.lstsq(H, gradient, rcond=1e-10)[0]
         T = turn_about(step[:3], centre, step[3:]) @ T
         next_gate = min(gate, max(3.0 * sigma, narrowest))
         motion = np.linalg.norm(step[3:]) + np.linalg.norm(step[:3]) * np.linalg.norm(np.ptp(points, axis=0))
@@ -89,7 +80,7 @@ def refine_pose(
             stride = least  # the last iterations use many more points
         gate = next_gate
     pairs = _match_pairs(scan, reference, T, gate, lateral, stride)
-    return RefinedPose(T, gate, None if pairs is None else _estimate_uncertainty(*pairs))
+    return RefinedPose(T, gate, None if pairs is None else _estimate_uncertainty(*pairs, T, markers))
 
 
 def _match_pairs(
@@ -118,6 +109,12 @@ def _match_pairs(
     return (points[is_pair], normal[is_pair], residual[is_pair]) if np.count_nonzero(is_pair) >= _MIN_PAIRS else None
 
 
+def _count_alike(points: np.ndarray) -> float:
+    """Return how many of the pairs' points (n, 3) count as one measurement beside markers: what a calibration leaves
+    bent is alike over a good part of the surface, and a plane would slide until it fits."""
+    return max(1.0, len(points) / _INDEPENDENT)
+
+
 def _jacobian(arm: np.ndarray, normal: np.ndarray) -> np.ndarray:
     """Return the derivatives (n, 6) of point-to-plane residuals by a small rotation (rad) and translation (mm).
 
@@ -126,22 +123,27 @@ def _jacobian(arm: np.ndarray, normal: np.ndarray) -> np.ndarray:
     return np.hstack([np.cross(arm, normal), normal])
 
 
-def _estimate_uncertainty(points: np.ndarray, normal: np.ndarray, residual: np.ndarray) -> Uncertainty | None:
-    """Estimate the uncertainty of a pose from its pairs by a cluster-robust covariance; None for too few patches."""
+def _estimate_uncertainty(
+    points: np.ndarray, normal: np.ndarray, residual: np.ndarray, T: np.ndarray, markers: MarkerPose | None
+) -> Uncertainty | None:
+    """Estimate the uncertainty of a pose ``T`` (4, 4) from its pairs by a cluster-robust covariance, and from the
+    standard deviations of markers; None for too few patches."""
     centre = points.mean(axis=0)
     arm = points - centre
     sigma = max(robust_sigma(residual, about=0.0), 1e-6)
     J, weight = _jacobian(arm, normal), tukey_weights(residual, sigma)
     H = (J * weight[:, None]).T @ J
     gradient = J * (weight * residual)[:, None]
+    alike = _count_alike(points)
+    H_markers = np.zeros((6, 6)) if markers is None else markers.normal_equations(T, centre, sigma * np.sqrt(alike))[0]
     diameter = 2.0 * float(np.sqrt(np.mean(np.sum(arm**2, axis=1))))
     largest = None
     for share in _PATCHES:
         patches = _sum_by_cube(gradient, arm, diameter / share)
         if len(patches) < _LEAST_PATCHES and largest is not None:
             break
-        meat = patches.T @ patches * len(patches) / max(len(patches) - 6, 1)
-        inverse = np.linalg.pinv(H, rcond=1e-12, hermitian=True)
+        meat = patches.T @ patches * len(patches) / max(len(patches) - 6, 1) + alike * sigma**2 * H_markers
+        inverse = np.linalg.pinv(H + H_markers, rcond=1e-12, hermitian=True)
         covariance = inverse @ meat @ inverse
         # errors that are correlated over more than one patch show in larger patches only
         if largest is None or np.trace(covariance[3:, 3:]) > np.trace(largest[3:, 3:]):

@@ -14,8 +14,8 @@ from slviewer.geometry.rigid import fit_rigid, move_points, rigid_transform
 from slviewer.registration.open3d_loader import align_icp, open3d
 from slviewer.registration.prepared import PreparedScan
 
-Start = Literal["features", "centroids", "initial", "picked", "turntable"]
-"""How a start was found: searched for (the first two); the last pose, picked points, the turntable's angle."""
+Start = Literal["features", "centroids", "initial", "picked", "turntable", "markers"]
+"""How a start was found: searched for (the first two); the last pose, picked points, the turntable's angle, markers."""
 SEARCHED: tuple[Start, ...] = ("features", "centroids")
 
 _TRIPLETS = 60_000

@@ -100,7 +100,10 @@ def register_object(
     """
     report = progress or (lambda share: None)
     all_samples = {name: sample_surface(cloud.measured) for name, cloud in clouds.items()}
+    markers = starts.markers if starts is not None else None
     alignment, static = None, _detect_unmoved_points(clouds, all_samples)
+    if markers:  # they tell how the object moved, also where a plane in its own plane seems to stand still
+        static = {name: np.zeros_like(mask) for name, mask in static.items()}
     if any(mask.any() for mask in static.values()):
         alignment = _try_register(remove_points(clouds, static), reference, starts, lambda share: report(0.5 * share))
         if alignment is not None:
@@ -117,7 +120,7 @@ def register_object(
             break
         candidate = remove_points(clouds, static)
         refined = _try_register(
-            candidate, reference, Starts(poses=alignment.T_reference_scan), lambda share: report(0.9)
+            candidate, reference, Starts(poses=alignment.T_reference_scan, markers=markers), lambda share: report(0.9)
         )
         if refined is None:  # too few points remain of a scan: its background may be needed to determine its pose
             static = {name: np.zeros_like(mask) for name, mask in static.items()}

@@ -25,11 +25,14 @@ def write_sheet(board: Board, path: Path | str, margin_mm: float | None = None) 
     page's right and down are the board's x and y. Raises InputError for other suffixes, for pages that PDF cannot
     hold, and where the file cannot be written.
     """
-    path = Path(path)
+    write_drawing(draw_board(board, margin_mm), Path(path))
+
+
+def write_drawing(drawing: Drawing, path: Path) -> None:
+    """Write a drawing as a .pdf or .svg page; raises as ``write_sheet``."""
     suffix = path.suffix.lower()
     if suffix not in (".pdf", ".svg"):
         raise InputError(f"a sheet cannot be written as '{path.name}': give a name that ends in .pdf or .svg")
-    drawing = draw_board(board, margin_mm)
     if suffix == ".pdf" and max(drawing.width, drawing.height) > LARGEST_PDF_MM:
         raise InputError(
             f"a page of {drawing.width:.0f}x{drawing.height:.0f} mm is more than a PDF can hold "

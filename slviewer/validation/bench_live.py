@@ -26,7 +26,7 @@ from slviewer.pipeline.feedback import Progress, ignore_progress
 from slviewer.pipeline.models import save_imported_stereo
 from slviewer.server.secure import SafeServer, Serving
 from slviewer.session.store import Session
-from slviewer.simulation.rig import letter
+from slviewer.simulation.rig import SimulatedRig, letter
 from slviewer.simulation.truth import rig_record
 from slviewer.wizard.operator import Operator
 
@@ -98,7 +98,7 @@ def live_rate(scale: float = 0.5, seconds: float = 30.0, progress: Progress = ig
     progress(0.0, "preparing the rig")
     with tempfile.TemporaryDirectory() as folder:
         session = Path(folder) / "session"
-        true_calibration(session, scale)
+        true_calibration(session, letter(scale))
         with Operator(session, {"driver": "simulated", "scale": scale}) as operator, _serve_wizard(operator) as server:
             _wait_until(lambda: operator.snapshot().rig.state == "open", operator)
             operator.place("object")
@@ -225,9 +225,8 @@ def _serve_wizard(operator: Operator) -> Iterator[SafeServer]:
         app.close()
 
 
-def true_calibration(folder: Path, scale: float) -> None:
-    """Make a session whose stereo calibration is that of the simulated rig's true lenses, local distortion apart."""
-    rig = letter(scale)
+def true_calibration(folder: Path, rig: SimulatedRig) -> None:
+    """Make a session whose stereo calibration is that of a simulated rig's true lenses, local distortion apart."""
     record = rig_record(rig)
     matrices = {f"{m}_{d}": np.array(record[d][m]) for m in ("K", "D") for d in ("camera", "projector")}
     matrices |= {"R": np.array(record["R"]), "T": np.array(record["t"])}

@@ -214,7 +214,7 @@ def _time_whole_captures(scene: Any) -> list[Row]:
 
 def _save_scans(session: Path, scale: float, scene: Any, count: int) -> None:
     """Make a session with the rig's true calibration and so many equal scans."""
-    true_calibration(session, scale)
+    true_calibration(session, letter(scale))
     rig = letter(scale)
     sequence = one_axis(p18(rig.projector.size), "x")
     frames = Renderer(rig, scene).capture(sequence)

@@ -15,20 +15,26 @@ from scipy.spatial.transform import Rotation
 from slviewer.errors import InputError
 from slviewer.evaluation import letter as the_letter
 from slviewer.evaluation.render import Row
-from slviewer.geometry.rigid import fit_rigid
+from slviewer.fringe.decode import texture
+from slviewer.fringe.presets import p18
+from slviewer.fringe.sequence import one_axis
+from slviewer.geometry.rigid import fit_rigid, move_points
 from slviewer.inspection.deviation import deviation
+from slviewer.pipeline.capture_phases import decode_frames
 from slviewer.pipeline.feedback import Progress, ignore_progress, part
 from slviewer.pipeline.simulate import TARGET, turn_plan
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.reconstruction.reconstruct import Model, reconstruct
+from slviewer.registration.markers import measure_markers
 from slviewer.registration.multiway import Alignment, Starts, register_all
 from slviewer.registration.pairwise import Registration
 from slviewer.registration.refusal import Refused
 from slviewer.simulation.boards import Pose, blank_board
+from slviewer.simulation.decals import MarkedScene, cylinder_mesh, marked_cylinder, marked_plate, marked_sphere
 from slviewer.simulation.mesh import MeshScene, demo_object
 from slviewer.simulation.plans import rotation
 from slviewer.simulation.renderer import Renderer
-from slviewer.simulation.rig import letter
+from slviewer.simulation.rig import SimulatedRig, letter
 from slviewer.simulation.scenes import Scene, sphere
 from slviewer.simulation.turning import STEP_DEG, stone
 from slviewer.surface.fuse import fuse
@@ -41,6 +47,7 @@ from slviewer.validation.rendered_calibration import calibrate_rendered, render_
 POSES = 25
 SHIFT_MM, TURN_DEG = 0.020, 0.01
 LOOP_MM = 0.05
+MARKERS_MM = 0.05
 SECONDS = 5.0
 HONEST = (0.7, 1.5)
 """Predicted over true error, pooled over all pairs."""
@@ -146,6 +153,9 @@ def prove_registration(
         refusals[what] = {"wanted": wanted, "got": reason}
         is_right = float(reason in wanted.split("/"))
         surfaces.append(BandCheck(what, f"refused as {wanted} (it was: {reason})", is_right, 1.0, 1.0))
+    for k, (what, marked) in enumerate(_make_marked_pairs().items()):
+        progress(0.98, f"{what} by markers")
+        surfaces.append(_check_markers(rig, model, what, marked, T_calibrated_camera, 950 + 2 * k))
     progress(1.0, "proven")
     rows = depths.rows() + turn.rows()
     checks += surfaces
@@ -228,7 +238,7 @@ def _make_ambiguous_pairs() -> dict[str, tuple[str, Scene, Scene]]:
     first, second = (
         Pose(rotation(np.radians(turns)), place) for turns, place in (((4.0, -6.0, 2.0), near), ((-5.0, 3.0, 6.0), far))
     )
-    cylinder = _make_cylinder_mesh(40.0, 150.0)
+    cylinder = cylinder_mesh(40.0, 150.0)
     return {
         "two scans of a plane": ("plane", blank_board(first), blank_board(second)),
         "two scans of a sphere": ("sphere", sphere((4.0, -3.0, 640.0)), sphere((-8.0, 6.0, 690.0))),
@@ -241,14 +251,42 @@ def _make_ambiguous_pairs() -> dict[str, tuple[str, Scene, Scene]]:
     }
 
 
-def _make_cylinder_mesh(radius: float, length: float) -> tuple[np.ndarray, np.ndarray]:
-    """An open cylinder along y with facets smaller than the noise: vertices (n, 3) mm, triangles (m, 3)."""
-    around = 720
-    angles = np.arange(around) * 2 * np.pi / around
-    ring = np.stack([radius * np.cos(angles), np.zeros(around), radius * np.sin(angles)], axis=1)
-    vertices = np.concatenate([ring + np.array([0, y, 0]) for y in (-length / 2, length / 2)])
-    i, j = np.arange(around), (np.arange(around) + 1) % around
-    return vertices, np.concatenate([np.stack([i, i + around, j], 1), np.stack([j, i + around, j + around], 1)])
+def _make_marked_pairs() -> dict[str, tuple[MarkedScene, MarkedScene]]:
+    """Two scans each of shapes that do not hold a pose, with coded markers on them."""
+    first, second = (
+        Pose(rotation(np.radians(turns)), np.array(place))
+        for turns, place in (((4.0, -6.0, 2.0), (0.0, 0.0, 620.0)), ((-5.0, 8.0, 16.0), (6.0, -4.0, 640.0)))
+    )
+    behind = [Pose(pose.R, pose.t + np.array([0.0, 0.0, 60.0])) for pose in (first, second)]
+    return {
+        "plane": (marked_plate(first), marked_plate(second)),
+        "sphere": (marked_sphere(behind[0]), marked_sphere(behind[1])),
+        "cylinder": (marked_cylinder(first), marked_cylinder(second)),
+    }
+
+
+def _check_markers(
+    rig: SimulatedRig,
+    model: Model,
+    what: str,
+    pair: tuple[MarkedScene, MarkedScene],
+    T_calibrated_camera: np.ndarray,
+    number: int,
+) -> BandCheck:
+    """The largest error over the surface of the second scan, registered by markers onto the first."""
+    clouds = {}
+    for k, (name, scene) in enumerate(zip("ab", pair, strict=True)):
+        sequence = one_axis(p18(rig.projector.size), "x")
+        frames = Renderer(rig, scene).capture(sequence, number + k)
+        phases = decode_frames(name, sequence, frames)
+        clouds[name] = reconstruct(model, phases, texture=texture(sequence, frames))
+    markers = {name: measure_markers(cloud) for name, cloud in clouds.items()}
+    T = register_all(clouds, "a", Starts(markers=markers)).T_reference_scan["b"]
+    true = [T_calibrated_camera @ _to_matrix(scene.pose) for scene in pair]
+    points = clouds["b"].measured[::_EVERY].astype(float)
+    gap = move_points(T, points) - move_points(true[0] @ np.linalg.inv(true[1]), points)
+    error = float(np.linalg.norm(gap, axis=1).max())
+    return BandCheck(f"two scans of a {what}, by markers", "largest error in mm", error, 1e-4, MARKERS_MM)
 
 
 def _measure_motion(D: np.ndarray, centre: np.ndarray) -> tuple[float, float]:

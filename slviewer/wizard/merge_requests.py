@@ -16,6 +16,7 @@ MERGING = "Merging"
 T = TypeVar("T")
 _ALTERNATIVES = {
     "features": "Or use the initial alignment by picked points.",
+    "markers": "Or use the initial alignment by features, or by picked points.",
     "placed": "Or use the initial alignment by features, or by picked points.",
     "turntable": "Or use the initial alignment by features, or by picked points.",
     "identity": "Or use the initial alignment by features, or by picked points.",

@@ -113,6 +113,7 @@ def merge_view(name: str, meta: Mapping[str, Any], stale: bool) -> MergeView:
         refused=tuple(f"{pair['scan']} → {pair['onto']}: {pair['why']}" for pair in meta.get("refused", ())),
         stray=stray,
         shared=meta.get("shared"),
+        markers=tuple((m["scan"], m["onto"], len(m["ids"]), m["rms_mm"]) for m in meta.get("markers", ())),
     )
 
 

@@ -215,7 +215,8 @@ class MergeView:
 
     `registered`: the pairs that it was made from; `loops` that these close, the worst first; `dropped`: pairs that the
     others contradict, and `refused` ones that did not register, in sentences. `stray`: {kind: number of pixels that lie
-    on no surface}; `shared`: the share of the points measured by several scans.
+    on no surface}; `shared`: the share of the points measured by several scans. `markers`: scan, onto,
+    number of common markers, and RMS distance of their corners in mm.
     """
 
     name: str
@@ -230,6 +231,7 @@ class MergeView:
     refused: tuple[str, ...] = ()
     stray: Mapping[str, int] = field(default_factory=dict)
     shared: float | None = None
+    markers: tuple[tuple[str, str, int, float], ...] = ()
 
 
 @dataclass(frozen=True)

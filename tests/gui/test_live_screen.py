@@ -12,6 +12,7 @@ from slviewer.fringe.layout import to_eight_bits
 from slviewer.gui.app import App
 from slviewer.gui.scene import thin
 from slviewer.server.secure import Serving
+from slviewer.simulation.rig import letter
 from slviewer.validation import bench_live as rate
 from slviewer.validation.bench_live import true_calibration
 from slviewer.wizard.operator import Operator
@@ -26,7 +27,7 @@ COMPILED_MS = 240_000
 @pytest.fixture
 def app(tmp_path: Path) -> Iterator[App]:
     folder = tmp_path / "session"
-    true_calibration(folder, SCALE)
+    true_calibration(folder, letter(SCALE))
     slow = {"driver": "simulated", "scale": SCALE, "settle_ms": 30}  # the browser needs the cores too
     with Operator(folder, slow) as operator:
         assert operator.wait_for(lambda s: s.rig.state == "open", 20.0) is not None

@@ -1,11 +1,25 @@
 """What `merge` is told of where scans lie, before it computes anything; the whole way is in test_commands."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
-from slviewer.errors import UsageError
+from slviewer.devices.simulated import simulated_rig
+from slviewer.devices.world import SimulatedWorld
+from slviewer.errors import InputError, UsageError
+from slviewer.geometry.rigid import move_points, rigid_transform
+from slviewer.gui.merge_html import merge_html
+from slviewer.pipeline.capture import capture
 from slviewer.pipeline.merge import merge
+from slviewer.pipeline.rig_choice import RigSetup
 from slviewer.registration.refusal import Refused
+from slviewer.session.store import Session
+from slviewer.simulation.boards import Pose
+from slviewer.simulation.plans import rotation
+from slviewer.simulation.rig import letter
+from slviewer.validation.bench_live import true_calibration
+from slviewer.wizard.result_views import merge_view
 
 
 def test_starts_that_do_not_fit_together_are_refused_at_once(tmp_path) -> None:
@@ -22,3 +36,49 @@ def test_starts_that_do_not_fit_together_are_refused_at_once(tmp_path) -> None:
         merge(tmp_path / "nowhere", ["b"], "b", out)
     with pytest.raises(UsageError, match=r"\.ply.*merged\.stl"):
         merge(tmp_path / "nowhere", ["a"], "b", out.with_suffix(".stl"))
+
+
+def test_a_plate_is_merged_by_its_markers(tmp_path: Path) -> None:
+    """Two scans of the simulated rig's marked plate, which slides on itself without them."""
+    session = tmp_path / "session"
+    rig = letter(0.5, local_distortion_px=0.0)  # which the stereo model would leave in the shape
+    true_calibration(session, rig)
+    world = SimulatedWorld(rig)
+    poses = [
+        Pose(rotation(np.radians(turns)), np.array(place))
+        for turns, place in (((4.0, -6.0, 2.0), (0.0, 0.0, 620.0)), ((-5.0, 8.0, 16.0), (6.0, -4.0, 640.0)))
+    ]
+    for name, pose in zip(("one", "two"), poses, strict=True):
+        world.place("marked", pose)
+        bench = RigSetup(simulated_rig(world))
+        capture(session, name, {}, role="scan", patterns="complementary", set_up=lambda *_, bench=bench: bench)
+    with pytest.raises(Refused, match="markers"):
+        merge(session, ["two"], "one")
+    merged = merge(session, ["two"], "one", start="markers")
+    T = [rigid_transform(pose.R, pose.t) for pose in poses]
+    points = merged.clouds["two"].measured[::50].astype(float)
+    gap = move_points(merged.pairs["two"].T_reference_scan, points)
+    gap -= move_points(T[0] @ np.linalg.inv(T[1]), points)
+    assert 0.001 < np.linalg.norm(gap, axis=1).max() < 0.08
+    (pair,) = merged.to_json()["markers"]
+    assert pair["ids"] == [0, 1, 2, 3, 4, 5] and pair["moved"] == [] and 0.001 < pair["rms_mm"] < 0.05
+    assert "6 common markers" in merged.text() and merged.pairs["two"].start == "markers"
+    with Session.open(session) as store:
+        view = merge_view("1", store.load_result("merge/1", only=())[0], stale=False)
+    assert view.markers == (("two", "one", 6, pair["rms_mm"]),)
+    assert "Common markers" in merge_html(view, {})
+
+
+def test_scans_without_markers_are_refused_with_what_to_do(tmp_path: Path) -> None:
+    session = tmp_path / "session"
+    true_calibration(session, letter(0.25))
+    world = SimulatedWorld(letter(0.25))
+    for name, depth in (("one", 600.0), ("two", 640.0)):
+        world.place("object")
+        world.move(distance_mm=depth)
+        bench = RigSetup(simulated_rig(world))
+        capture(session, name, {}, role="scan", patterns="gray", set_up=lambda *_, bench=bench: bench)
+    warnings: list[str] = []
+    with pytest.raises(InputError, match="slviewer target markers"):
+        merge(session, ["two"], "one", start="markers", warn=warnings.append)
+    assert any("one shows no marker" in warning for warning in warnings)

@@ -146,7 +146,7 @@ def test_a_browser_without_permission_says_so(browser, server, channel):
 
 def test_a_scan_by_a_phone_measures_the_plane(phone, film, server, channel, tmp_path):
     """From the page's pictures to a cloud, with the calibration of the true lenses."""
-    true_calibration(tmp_path / "session", SCALE)
+    true_calibration(tmp_path / "session", letter(SCALE))
     page = opened(phone, server)
     assert channel.wait_ready(10.0).state == "ready"
     world = SimulatedWorld(letter(SCALE))

@@ -136,7 +136,7 @@ def test_scans_as_they_lie_need_no_search_and_a_ball_holds_nothing(operator: Ope
     snapshot, after = settled(operator)
     assert after is not None and after.name == merge.name
     assert "round like a sphere: it turns about any axis" in snapshot.merge_failure
-    assert "put something with relief beside the object" in snapshot.merge_failure
+    assert "put coded markers on it or beside it" in snapshot.merge_failure
 
 
 def off_mm_between(merge: MergeView) -> float:

@@ -15,10 +15,13 @@ from slviewer.gui.widgets import Text
 from slviewer.wizard.snapshot import MergeView, ScanView, SessionView, Snapshot
 
 LAYER = "merge"
-FEATURES, PLACED, TURNTABLE = "features", "places while scanning", "turntable"
+FEATURES, MARKERS, PLACED, TURNTABLE = "features", "markers", "places while scanning", "turntable"
 CURRENT, PICKED = "current position", "picked points"
-STARTS = (FEATURES, PLACED, TURNTABLE, CURRENT, PICKED)
+STARTS = (FEATURES, MARKERS, PLACED, TURNTABLE, CURRENT, PICKED)
 SIDE_BY_SIDE = "side by side, to pick"
+_MARKERS_NOTE = (
+    "For coded markers on or beside the object, three or more in common: slviewer target markers:0-23:20 draws them."
+)
 _CURRENT_NOTE = "For scans between which neither the object nor the camera moved, or hardly."
 
 
@@ -165,7 +168,7 @@ class Panel(StepPanel):
                 given = [k * float(self._angle.value) for k in range(len(names))]
                 self._start_note.set(turntable_html(names, given if stored is None else stored, labels))
             else:
-                self._start_note.write(_CURRENT_NOTE if start == CURRENT else "", "dim")
+                self._start_note.write({CURRENT: _CURRENT_NOTE, MARKERS: _MARKERS_NOTE}.get(start, ""), "dim")
             chosen = {name: versions[name] for name in names}
             self._picker.offer(chosen, self._reference.value, labels, start == PICKED)
             ready = len(names) > 1 and (start != PICKED or self._picker.is_ready)
@@ -231,6 +234,8 @@ class Panel(StepPanel):
             merge(names, reference, start="turntable", angle=None if stored else float(self._angle.value))
         elif start == PLACED:
             merge(names, reference, start="placed")
+        elif start == MARKERS:
+            merge(names, reference, start="markers")
         elif start == CURRENT:
             merge(names, reference, start="identity")
         elif start == PICKED:

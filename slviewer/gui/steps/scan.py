@@ -82,7 +82,7 @@ class Panel(StepPanel):
             )
             self._live_status = Text(gui)
             self._turn = TurnInputs(context)
-            self._simulated = SimulatedObject(context, LAYER, ("object", "stone", "sphere", "plane"))
+            self._simulated = SimulatedObject(context, LAYER, ("object", "stone", "marked", "sphere", "plane"))
         self._gallery = Text(gui)
         with gui.add_folder("Cloud", visible=False) as self._cloud_folder:
             self._scan = Choice(gui, "Scan")

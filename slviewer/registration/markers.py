@@ -1,0 +1,224 @@
+"""Coded markers on scans: their corners in 3D, and the pose between two scans that they determine.
+
+A corner lies where a smooth surface, fitted to the points around it, meets the corner's line of sight; so neither the
+marker's own print nor the few points at its edges decide.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import combinations
+
+import cv2
+import numpy as np
+
+from slviewer.errors import InputError
+from slviewer.geometry.rigid import Floats, fit_rigid, move_points
+from slviewer.geometry.robust import robust_sigma, tukey_weights
+from slviewer.reconstruction.cloud import Cloud
+from slviewer.registration.refusal import Refused
+from slviewer.registration.uncertainty import Uncertainty
+from slviewer.target.coded import detect_markers
+
+CORNER_PX = 0.05
+"""Standard deviation of a corner in the image, beyond which its own residuals speak."""
+MOVED_SIGMAS, MOVED_MM, MOVED_MEDIANS = 6.0, 0.1, 4.0
+"""A marker whose corners are further from where the others put them, in standard deviations, mm, and medians of all
+markers, has been moved."""
+MOST_GAP = 0.005
+"""Of the markers' extent: where their gaps are larger in the median, no motion explains them."""
+LEAST_CORNER_POINTS = 40
+_MOST_HYPOTHESES = 2000
+_FIT_REACH = 0.75
+"""Radius of the surface around a corner over the marker's side."""
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredMarkers:
+    """Markers on a scan: numbers ``ids`` (n,), ``corners`` (n, 4, 3) mm in the scan's frame, their standard deviations
+    ``sigma_mm`` (n, 4), and the numbers that were ``repeated`` and are left out."""
+
+    ids: np.ndarray
+    corners: Floats
+    sigma_mm: Floats
+    repeated: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class MarkerPose:
+    """The pose ``T`` (4, 4), T_reference_scan, that the markers ``ids`` of two scans determine, with the corners of
+    both (m, 3) mm, their common standard deviations ``sigma_mm`` (m,), raised where their gaps are larger, and the
+    numbers that have ``moved``."""
+
+    T: Floats
+    ids: tuple[int, ...]
+    moved: tuple[int, ...]
+    scan_corners: Floats
+    reference_corners: Floats
+    sigma_mm: Floats
+
+    @property
+    def rms_mm(self) -> float:
+        """Root mean square distance of the corners."""
+        gap = move_points(self.T, self.scan_corners) - self.reference_corners
+        return float(np.sqrt(np.mean(np.sum(gap**2, axis=1))))
+
+    def normal_equations(self, T: Floats, centre: Floats, sigma_mm: float) -> tuple[Floats, Floats]:
+        """Matrix (6, 6) and gradient (6,) of the corners' squared gaps at a pose ``T`` (4, 4), by a small rotation
+        about ``centre`` (3,) and a shift, as those of residuals of ``sigma_mm``."""
+        placed = move_points(T, self.scan_corners)
+        weight = (sigma_mm / self.sigma_mm) ** 2
+        J = corner_jacobian(placed - centre)
+        H = np.einsum("mij,mik,m->jk", J, J, weight)
+        return H, np.einsum("mij,mi,m->j", J, placed - self.reference_corners, weight)
+
+    @property
+    def uncertainty(self) -> Uncertainty:
+        """Uncertainty of the pose about the corners' middle."""
+        centre = move_points(self.T, self.scan_corners).mean(axis=0)
+        return Uncertainty(np.linalg.inv(self.normal_equations(self.T, centre, 1.0)[0]), centre)
+
+
+def corner_jacobian(arm: Floats) -> Floats:
+    """Derivatives (m, 3, 6) of points ``arm`` (m, 3) mm from the centre by a small rotation (rad) and shift (mm)."""
+    J = np.zeros((len(arm), 3, 6))
+    J[:, :, 3:] = np.eye(3)
+    for k, (a, b) in enumerate(((1, 2), (2, 0), (0, 1))):  # rotation x arm
+        J[:, a, k], J[:, b, k] = -arm[:, b], arm[:, a]
+    return J
+
+
+def measure_markers(cloud: Cloud) -> MeasuredMarkers:
+    """Measure the corners of the coded markers that a scan's texture shows; raises InputError without a texture."""
+    if cloud.texture is None:
+        raise InputError("A cloud without a texture shows no markers: reconstruct the capture with its texture.")
+    grey = cloud.texture if cloud.texture.ndim == 2 else cv2.cvtColor(cloud.texture, cv2.COLOR_RGB2GRAY)
+    seen = detect_markers(np.asarray(grey, np.uint8))
+    ids, corners, sigmas = [], [], []
+    for number, quad in zip(seen.ids, seen.corners, strict=True):
+        measured = [_measure_corner(cloud, corner, quad) for corner in quad]
+        if all(one is not None for one in measured):
+            ids.append(int(number))
+            corners.append([one[0] for one in measured if one is not None])
+            sigmas.append([one[1] for one in measured if one is not None])
+    shape = (len(ids), 4)
+    return MeasuredMarkers(
+        np.array(ids, int), np.reshape(corners, (*shape, 3)).astype(float), np.reshape(sigmas, shape).astype(float),
+        seen.repeated,
+    )  # fmt: skip
+
+
+def _measure_corner(cloud: Cloud, corner: np.ndarray, quad: np.ndarray) -> tuple[Floats, float] | None:
+    """Return the point (3,) mm at a corner (2,) px of a marker ``quad`` (4, 2) px, and its standard deviation; None
+    where too little of the surface around it was measured."""
+    reach = _FIT_REACH * float(np.linalg.norm(quad - np.roll(quad, 1, axis=0), axis=1).mean())
+    height, width = cloud.points.shape[:2]
+    (left, top), (right, bottom) = np.floor(corner - reach).astype(int), np.ceil(corner + reach).astype(int) + 1
+    left, top, right, bottom = max(left, 0), max(top, 0), min(right, width), min(bottom, height)
+    v, u = np.mgrid[top:bottom, left:right]
+    points = cloud.points[top:bottom, left:right].astype(np.float64)
+    known = np.isfinite(points[..., 2]) & (np.hypot(u - corner[0], v - corner[1]) <= reach)
+    if np.count_nonzero(known) < LEAST_CORNER_POINTS:
+        return None
+    x, y = (u[known] - corner[0]) / reach, (v[known] - corner[1]) / reach
+    quadrants = {(bool(a), bool(b)) for a, b in zip(x > 0, y > 0, strict=True)}
+    if len(quadrants) < 4:  # the surface ends here: it would be extrapolated
+        return None
+    points = points[known]
+    basis = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
+    noise = np.maximum(np.nan_to_num(cloud.sigma[top:bottom, left:right][known], nan=1.0), 1e-6) / points[:, 2] ** 2
+    weight = noise**-2.0
+    for _ in range(3):  # a plane's 1/z is linear in the image
+        A = basis * weight[:, None]
+        covariance = np.linalg.inv(A.T @ basis)
+        fitted = covariance @ (A.T @ (1 / points[:, 2]))
+        residual = (1 / points[:, 2] - basis @ fitted) / noise
+        spread = max(robust_sigma(residual, about=0.0), 1e-6)
+        weight = noise**-2.0 * tukey_weights(residual, spread)
+    z = 1 / fitted[0]
+    sigma_z = spread * np.sqrt(covariance[0, 0]) * z**2
+    rays, *_ = np.linalg.lstsq(basis, points[:, :2] / points[:, 2:], rcond=None)
+    pitch = z * np.linalg.norm(rays[1:3]) / reach / np.sqrt(2)
+    return np.array([*(z * rays[0]), z]), float(np.hypot(sigma_z, CORNER_PX * pitch))
+
+
+def fit_marker_pose(scan: MeasuredMarkers, reference: MeasuredMarkers) -> MarkerPose | None:
+    """Fit the pose that brings the markers of a scan onto those of a reference; None without common ones.
+
+    Markers that contradict most of the others have been moved, and are excluded. Raises ``Refused`` where it is
+    undecidable which ones have.
+    """
+    common, mine, theirs = np.intersect1d(scan.ids, reference.ids, return_indices=True)
+    if not len(common):
+        return None
+    p, q = scan.corners[mine], reference.corners[theirs]
+    sigma = np.hypot(scan.sigma_mm[mine], reference.sigma_mm[theirs])
+    steady = _select_steady(p, q, sigma)
+    if len(common) > 1 and steady.sum() <= len(common) / 2:
+        raise Refused(
+            "picks",
+            f"Of {len(common)} common markers only {int(steady.sum())} keep their places: glue the markers on, or scan "
+            "without moving those beside the object.",
+        )
+    p, q, s = p[steady].reshape(-1, 3), q[steady].reshape(-1, 3), sigma[steady].ravel()
+    ids = tuple(int(number) for number in common[steady])
+    T = fit_weighted(p, q, s)
+    gap = np.sum((move_points(T, p) - q) ** 2, axis=1) / (3 * s**2)
+    s = s * np.sqrt(max(1.0, float(np.sum(gap)) / max(1.0, len(gap) - 2.0)))
+    return MarkerPose(T, ids, tuple(int(k) for k in common[~steady]), p, q, s)
+
+
+def fit_weighted(points: Floats, targets: Floats, sigma_mm: Floats) -> Floats:
+    """(4, 4): the motion of weighted least squares that brings points (m, 3) mm onto ``targets`` (m, 3)."""
+    T = fit_rigid(points, targets)
+    w = sigma_mm**-2.0 / np.sum(sigma_mm**-2.0)
+    p0, q0 = w @ points, w @ targets
+    root = np.sqrt(w)[:, None]
+    R = fit_rigid(
+        np.concatenate([root * (points - p0), -root * (points - p0)]),
+        np.concatenate([root * (targets - q0), -root * (targets - q0)]),
+    )[:3, :3]
+    T[:3, :3], T[:3, 3] = R, q0 - R @ p0
+    return T
+
+
+def _select_steady(p: Floats, q: Floats, sigma: Floats) -> np.ndarray:
+    """Return which markers (n,) bool keep their places, by the least median of their gaps.
+
+    A calibration that is not perfect leaves gaps too; so they are compared with the median one.
+    """
+    n = len(p)
+    if n == 1:
+        return np.ones(1, bool)
+    pairs = list(combinations(range(n), 2))
+    pairs = pairs[:: -(-len(pairs) // _MOST_HYPOTHESES)]
+    starts = (fit_rigid(p[list(pair)].reshape(-1, 3), q[list(pair)].reshape(-1, 3)) for pair in pairs)
+    gap = min((_largest_gaps(T, p, q) for T in starts), key=lambda gap: float(np.median(gap)))
+    steady = gap <= np.median(gap)
+    limit = np.zeros(n)
+    for _ in range(4):
+        T = fit_weighted(p[steady].reshape(-1, 3), q[steady].reshape(-1, 3), sigma[steady].ravel())
+        gap = _largest_gaps(T, p, q)
+        usual = float(np.median(gap))
+        limit = np.maximum(MOVED_SIGMAS * sigma.max(axis=1), max(MOVED_MM, MOVED_MEDIANS * usual))
+        steady = gap < limit
+        if steady.sum() < 2:
+            break
+    extent = float(np.linalg.norm(np.ptp(q.reshape(-1, 3), axis=0)))
+    return steady & (usual < max(MOVED_MM, MOST_GAP * extent))
+
+
+def _largest_gaps(T: Floats, p: Floats, q: Floats) -> Floats:
+    """Return the largest gap (n,) mm of each marker's corners after a motion (4, 4)."""
+    return np.asarray(np.linalg.norm(move_points(T, p) - q, axis=2).max(axis=1))
+
+
+def marker_notes(measured: Mapping[str, MeasuredMarkers]) -> list[str]:
+    """Sentences on markers that were left out, and on scans that show none."""
+    notes = []
+    for name, markers in measured.items():
+        if markers.repeated:
+            numbers = ", ".join(map(str, markers.repeated))
+            notes.append(f"{name} shows marker {numbers} more than once, which is ignored: use every number once")
+        if not len(markers.ids):
+            notes.append(f"{name} shows no marker that could be measured: bring markers into view, at least 16 px wide")
+    return notes

@@ -1,0 +1,114 @@
+"""Coded markers stuck onto the scenes of the simulated rig."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from slviewer.simulation.boards import Pose, blank_board
+from slviewer.simulation.mesh import MeshScene
+from slviewer.simulation.scenes import Scene, Surface, sphere
+from slviewer.target.coded import marker_modules
+
+WHITE, BLACK = 0.85, 0.09
+_QUIET = 0.2  # of the side: white around a marker
+_THICK_MM = 4.0  # how far from the decal's plane a curved surface may lie
+_SAMPLES = 4  # by the square of which a pixel's area is averaged
+
+
+@dataclass(frozen=True, eq=False)
+class Decal:
+    """A marker ``number`` of side ``side_mm``, whose middle is the origin of ``pose``, T_object_decal: x to its right,
+    y down, z into the surface."""
+
+    number: int
+    side_mm: float
+    pose: Pose
+
+    def albedo(self, xy: np.ndarray) -> np.ndarray:
+        """Albedo (...) at places (..., 2) mm of the decal's plane; NaN beyond its paper."""
+        modules = marker_modules(self.number)
+        cell = self.side_mm / len(modules)
+        at = np.floor(xy / cell + len(modules) / 2).astype(int)
+        inside = ((at >= 0) & (at < len(modules))).all(axis=-1)
+        at = np.clip(at, 0, len(modules) - 1)
+        printed = np.where(modules[at[..., 1], at[..., 0]] == 0, BLACK, WHITE)
+        paper = (np.abs(xy) <= self.side_mm * (0.5 + _QUIET)).all(axis=-1)
+        return np.where(inside, printed, np.where(paper, WHITE, np.nan))
+
+
+@dataclass(frozen=True, eq=False)
+class MarkedScene:
+    """An object's scene at ``pose`` with decals on it, which follow its surface and do not change its shape."""
+
+    scene: Scene
+    pose: Pose
+    decals: Sequence[Decal]
+
+    def trace(self, rays: np.ndarray) -> Surface:
+        """What the scene's rays meet, with the decals' albedo, averaged over each pixel's area."""
+        surface = self.scene.trace(rays)
+        with np.errstate(invalid="ignore"):
+            steps = [np.gradient(surface.points, axis=axis) for axis in (1, 0)]
+        albedo = surface.albedo.copy()
+        offsets = (np.arange(_SAMPLES) + 0.5) / _SAMPLES - 0.5
+        for decal in self.decals:
+            R = self.pose.R @ decal.pose.R  # of the decal in the camera's frame
+            local = (surface.points - self.pose.to_camera(decal.pose.t)) @ R
+            with np.errstate(invalid="ignore"):
+                near = (np.abs(local[..., :2]) < decal.side_mm).all(axis=-1) & (np.abs(local[..., 2]) < _THICK_MM)
+                near &= surface.normals @ R[:, 2] < 0
+            if not near.any():
+                continue
+            along, down = (np.nan_to_num(step[near] @ R[:, :2]) for step in steps)
+            own = albedo[near]
+            total = np.zeros_like(own)
+            for a in offsets:
+                for b in offsets:
+                    there = decal.albedo(local[near][:, :2] + a * along + b * down)
+                    total += np.where(np.isnan(there), own, there).astype(np.float32)
+            albedo[near] = total / _SAMPLES**2
+        return Surface(surface.points, surface.normals, albedo)
+
+    def occluded(self, points: np.ndarray, source: np.ndarray) -> np.ndarray:
+        """As the scene itself: paper shades nothing."""
+        return self.scene.occluded(points, source)
+
+
+def marked_plate(pose: Pose) -> MarkedScene:
+    """A blank plate with six markers."""
+    places = ((-60.0, -45.0), (0.0, -50.0), (60.0, -45.0), (-60.0, 40.0), (5.0, 45.0), (60.0, 45.0))
+    decals = [Decal(i, 16.0, Pose(np.eye(3), np.array([x, y, 0.0]))) for i, (x, y) in enumerate(places)]
+    return MarkedScene(blank_board(pose), pose, decals)
+
+
+def marked_sphere(pose: Pose) -> MarkedScene:
+    """The Letter's sphere with six markers on its front."""
+    turns = ((-25, -15), (0, -22), (25, -15), (-20, 20), (5, 22), (25, 18))
+    radius = 98.0
+    decals = []
+    for i, (around, up) in enumerate(turns):
+        R = Rotation.from_euler("yx", (around, up), degrees=True).as_matrix()
+        decals.append(Decal(i, 16.0, Pose(R, R @ np.array([0.0, 0.0, -radius]))))
+    return MarkedScene(sphere(tuple(pose.t.tolist()), 2 * radius), pose, decals)
+
+
+def marked_cylinder(pose: Pose, radius: float = 40.0, length: float = 150.0) -> MarkedScene:
+    """An open cylinder about the y axis with six markers on its front."""
+    places = ((-30, -40.0), (0, -45.0), (30, -40.0), (-25, 35.0), (5, 40.0), (30, 35.0))
+    decals = []
+    for i, (around, y) in enumerate(places):
+        R = Rotation.from_euler("y", around, degrees=True).as_matrix()
+        decals.append(Decal(i, 14.0, Pose(R, R @ np.array([0.0, 0.0, -radius]) + np.array([0.0, y, 0.0]))))
+    return MarkedScene(MeshScene(*cylinder_mesh(radius, length), pose), pose, decals)
+
+
+def cylinder_mesh(radius: float, length: float) -> tuple[np.ndarray, np.ndarray]:
+    """An open cylinder along y with facets smaller than the noise: vertices (n, 3) mm, triangles (m, 3)."""
+    around = 720
+    angles = np.arange(around) * 2 * np.pi / around
+    ring = np.stack([radius * np.cos(angles), np.zeros(around), radius * np.sin(angles)], axis=1)
+    vertices = np.concatenate([ring + np.array([0, y, 0]) for y in (-length / 2, length / 2)])
+    i, j = np.arange(around), (np.arange(around) + 1) % around
+    return vertices, np.concatenate([np.stack([i, i + around, j], 1), np.stack([j, i + around, j + around], 1)])
