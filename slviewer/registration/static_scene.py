@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from slviewer.errors import InputError
 from slviewer.geometry.rigid import move_points
-from slviewer.reconstruction.cloud import Cloud
+from slviewer.reconstruction.cloud import Cloud, choose_pixels
 from slviewer.registration.multiway import Alignment, Pair, Starts, register_all
 from slviewer.registration.open3d_loader import open3d
 from slviewer.registration.pairwise import Progress
@@ -26,6 +26,8 @@ LEAST_SHARE = 0.01
 """Least share of static samples in a scan with a static background; fewer are scatter."""
 LEAST_PART = 0.05
 """Least share of every scan that must agree without motion for an initial segmentation."""
+NOISY = 3.0
+"""Times the median standard deviation of a scan beyond which a point is not compared."""
 QUARTILE = 0.3186
 """Lower quartile of the absolute value of a normal variable, in standard deviations."""
 ROUNDS = 3
@@ -99,7 +101,7 @@ def register_object(
     ``progress`` receives the completed share of the work, 0 to 1, and may raise to cancel.
     """
     report = progress or (lambda share: None)
-    all_samples = {name: sample_surface(cloud.measured) for name, cloud in clouds.items()}
+    all_samples = {name: sample_surface(_select_precise(cloud)) for name, cloud in clouds.items()}
     markers = starts.markers if starts is not None else None
     alignment, static = None, _detect_unmoved_points(clouds, all_samples)
     if markers:  # they tell how the object moved, also where a plane in its own plane seems to stand still
@@ -128,7 +130,7 @@ def register_object(
             break
         pairs = {pair: replace(r, start=first_start.get(pair, r.start)) for pair, r in refined.pairs.items()}
         alignment, moving = replace(refined, pairs=pairs), candidate
-        samples = {name: sample_surface(cloud.measured) for name, cloud in moving.items()}
+        samples = {name: sample_surface(_select_precise(cloud)) for name, cloud in moving.items()}
         before, static = static, detect_static_points(clouds, all_samples, alignment)
         if all(np.count_nonzero(static[n] ^ before[n]) < SETTLED * before[n].size for n in static):
             static = before
@@ -140,6 +142,14 @@ def register_object(
     }
     report(1.0)
     return ObjectAlignment(alignment, moving, static, contradictions)
+
+
+def _select_precise(cloud: Cloud) -> np.ndarray:
+    """Return the points (n, 3) mm of a cloud but the noisiest, which on dark print lie further off than the others."""
+    mask = cloud.mask
+    sigma = cloud.sigma_z[mask]
+    usual = np.nanmedian(sigma) if np.isfinite(sigma).any() else np.inf
+    return choose_pixels(cloud.points, mask)[~(sigma > NOISY * usual)]
 
 
 def remove_points(clouds: Mapping[str, Cloud], static: Mapping[str, np.ndarray]) -> dict[str, Cloud]:
