@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal
 
@@ -9,6 +10,7 @@ import numpy as np
 
 from slviewer.errors import InputError, UsageError
 from slviewer.evaluation import letter
+from slviewer.geometry.rigid import rotation_angle
 from slviewer.pipeline.align import load_places
 from slviewer.pipeline.capture_clouds import capture_cloud, check_capture_sizes
 from slviewer.pipeline.capture_phases import capture_texture, decode_captures
@@ -17,18 +19,21 @@ from slviewer.pipeline.models import ModelName, check_accepted, frame_of, load_m
 from slviewer.pipeline.open_session import SessionLike, next_number, opened
 from slviewer.pipeline.scale import describe_scale, scale_factor
 from slviewer.reconstruction.cloud import Cloud
-from slviewer.registration.markers import MeasuredMarkers, marker_notes, measure_markers
+from slviewer.registration.markers import MeasuredMarkers, fit_marker_pose, marker_notes, measure_markers
 from slviewer.registration.multiway import Alignment, Pair, Starts
 from slviewer.registration.pairwise import Registration
 from slviewer.registration.picked import fit_picked_start
+from slviewer.registration.refusal import Refused
 from slviewer.registration.static_scene import ObjectAlignment, SceneContradiction, register_object
-from slviewer.registration.turntable import TurntableAxis
+from slviewer.registration.turntable import TurntableAxis, shortest_turn
 from slviewer.session.ply import write_ply
 from slviewer.session.store import Session
 from slviewer.surface.fuse import Fused, fuse
 
 MAX_CONTRADICTION_SHARE = 0.01
 """Share of contradicting points from which on a pair is warned about: noise alone has fewer than one in a million."""
+MAT_MARKERS, MAT_TURN_DEG = 3, 3.0
+"""Markers in common from which on a turntable's mat is used, and how far its turn may be from the table's."""
 StartKind = Literal["features", "turntable", "identity", "placed", "markers"]
 Picked = Mapping[Pair, tuple[np.ndarray, np.ndarray]]
 """Of a pair (scan, onto): three or more points (n, 3) mm on either, in their cameras' frames."""
@@ -177,7 +182,8 @@ def merge(
         reference: The capture whose frame the merged cloud takes.
         out: PLY file. Without it the session stores the merge as merge/1 and so on, for mesh, compare, measure and
             export, and its file is in the session's exports.
-        start: Initial alignment: features estimates it from the scans; turntable uses the angles of the turntable;
+        start: Initial alignment: features estimates it from the scans; turntable uses the angles of the turntable,
+            and the markers of a mat on it where the scans show them;
             identity assumes that the scans are nearly aligned already; placed takes the places that `align` found;
             markers takes coded markers (`slviewer target markers:0-23:20`) that the scans show, which also hold what
             the shape leaves open.
@@ -229,6 +235,8 @@ def merge(
             )
         if start == "markers":
             starts = replace(starts, markers=_measure_markers(clouds, warn))
+        elif table_deg is not None:
+            starts = replace(starts, markers=_measure_mat(clouds, table_deg, warn))
         registered = register_object(clouds, reference, starts, stage(progress, 0.4, 0.75, "registering"))
         alignment = registered.alignment
         for why in [
@@ -271,6 +279,32 @@ def _measure_markers(clouds: Mapping[str, Cloud], warn: Warn) -> dict[str, Measu
             "put them on or beside the object so that neighbouring scans share three or more, and scan again; or start "
             "from features"
         )
+    return measured
+
+
+def _measure_mat(
+    clouds: Mapping[str, Cloud], table_deg: Mapping[str, float], warn: Warn
+) -> dict[str, MeasuredMarkers] | None:
+    """Measure the markers on a turntable, from which its axis follows; None where there are none, or where they do not
+    turn with it."""
+    measured = {name: measure_markers(cloud) for name, cloud in clouds.items()}
+    compared = []
+    for a, b in pairwise(name for name in clouds if name in table_deg):
+        try:
+            pose = fit_marker_pose(measured[a], measured[b])
+        except Refused:
+            pose = None
+        if pose is not None and len(pose.ids) >= MAT_MARKERS:
+            turn_deg = abs(shortest_turn(table_deg[b] - table_deg[a]))
+            compared.append(abs(float(np.degrees(rotation_angle(pose.T[:3, :3]))) - turn_deg))
+    if not compared:
+        return None
+    if max(compared) > MAT_TURN_DEG:
+        warn(
+            f"coded markers are in view, and they turn by {max(compared):.1f} degrees more or less than the table: "
+            "they are ignored; put them on the table, or check its angles"
+        )
+        return None
     return measured
 
 

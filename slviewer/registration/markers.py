@@ -62,6 +62,11 @@ class MarkerPose:
         gap = move_points(self.T, self.scan_corners) - self.reference_corners
         return float(np.sqrt(np.mean(np.sum(gap**2, axis=1))))
 
+    def inverse(self) -> "MarkerPose":
+        """The pose of the reference on the scan."""
+        T = np.asarray(np.linalg.inv(self.T), np.float64)
+        return MarkerPose(T, self.ids, self.moved, self.reference_corners, self.scan_corners, self.sigma_mm)
+
     def normal_equations(self, T: Floats, centre: Floats, sigma_mm: float) -> tuple[Floats, Floats]:
         """Matrix (6, 6) and gradient (6,) of the corners' squared gaps at a pose ``T`` (4, 4), by a small rotation
         about ``centre`` (3,) and a shift, as those of residuals of ``sigma_mm``."""

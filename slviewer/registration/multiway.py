@@ -175,13 +175,14 @@ class _PoseGraphBuilder:
         """List every pair of a few scans, or each scan with the one before it and the last with the first; with markers
         those pairs that show the same ones."""
         names = self.names
-        if self.starts.markers is not None:
+        if self.starts.markers is not None and not self.starts.table_deg:
             return list(self.markers)
         if len(names) <= ALL_PAIRS:
             pairs = [(a, b) for i, a in enumerate(names) for b in names[:i]]
         else:
             pairs = [(b, a) for a, b in pairwise(names)] + [(names[-1], names[0])]
-        return [(b, a) if a == self.reference else (a, b) for a, b in pairs]
+        pairs = [(b, a) if a == self.reference else (a, b) for a, b in pairs]
+        return pairs + [pair for pair in self.markers if not {pair, pair[::-1]} & {*pairs}]
 
     def _initial_poses(self) -> dict[str, tuple[np.ndarray, Start]]:
         """Return T_world_scan (4, 4) mm by name from given poses or the turntable, and its origin; {} without these."""
@@ -236,6 +237,11 @@ class _PoseGraphBuilder:
                 count[a], count[b] = count[a] + 1, count[b] + 1
                 chosen[a, b] = pose
         return chosen
+
+    def _get_markers(self, pair: Pair) -> MarkerPose | None:
+        """Return the pose of a pair by its common markers, whichever way round it was fitted; None without these."""
+        turned = self.markers.get(pair[::-1])
+        return self.markers.get(pair) or (None if turned is None else turned.inverse())
 
     def _relative_pose(self, known: Mapping[str, tuple[np.ndarray, Start]], scan: str, onto: str) -> Candidate | None:
         """Return the initial pose of a pair from poses in a common frame; None where one of them is not known."""
@@ -332,7 +338,7 @@ class _PoseGraphBuilder:
                 size=self.size,
                 initial=start,
                 starts=starts,
-                markers=self.markers.get(pair),
+                markers=self._get_markers(pair),
                 progress=lambda share: self._report(before + step * share),
             )
         except Refused as error:
@@ -410,7 +416,7 @@ class _PoseGraphBuilder:
                 self.scans[edge.onto],
                 size=self.size,
                 initial=Candidate(T, "initial"),
-                markers=self.markers.get((self.names[edge.scan], self.names[edge.onto])),
+                markers=self._get_markers((self.names[edge.scan], self.names[edge.onto])),
             )
         except Refused:
             return False

@@ -82,3 +82,28 @@ def test_scans_without_markers_are_refused_with_what_to_do(tmp_path: Path) -> No
     with pytest.raises(InputError, match="slviewer target markers"):
         merge(session, ["two"], "one", start="markers", warn=warnings.append)
     assert any("one shows no marker" in warning for warning in warnings)
+
+
+def test_the_mat_on_a_turntable_gives_its_axis(tmp_path: Path) -> None:
+    """A plate with markers, turned in steps that are stated 1 degree too small."""
+    session = tmp_path / "session"
+    rig = letter(0.5, local_distortion_px=0.0)
+    true_calibration(session, rig)
+    world = SimulatedWorld(rig)
+    world.place("marked")
+    names, poses = ["one", "two", "three"], []
+    for k, name in enumerate(names):
+        world.turn_table(12.0 * (k - 1))
+        poses.append(rigid_transform(world.pose.R, world.pose.t))
+        bench = RigSetup(simulated_rig(world))
+        capture(session, name, {}, role="scan", patterns="complementary", set_up=lambda *_, bench=bench: bench)
+    merged = merge(session, names, "one", start="turntable", angle=11.0, out=tmp_path / "merged.ply")
+    for k, name in enumerate(names[1:], 1):
+        points = merged.clouds[name].measured[::50].astype(float)
+        gap = move_points(merged.pairs[name].T_reference_scan, points)
+        gap -= move_points(poses[0] @ np.linalg.inv(poses[k]), points)
+        assert 0.001 < np.linalg.norm(gap, axis=1).max() < 0.1
+    warnings: list[str] = []
+    with pytest.raises(Refused):
+        merge(session, names, "one", start="turntable", angle=30.0, out=tmp_path / "m.ply", warn=warnings.append)
+    assert any("markers" in warning and "18.0 degrees" in warning for warning in warnings)
