@@ -21,6 +21,23 @@ def test_workers_that_deliver_at_once_do_not_trip_each_other(tmp_path: Path) -> 
     assert found == {f"{w}_{k}.ply": bytes([w]) for w in range(WORKERS) for k in range(EACH)}
 
 
+def test_two_attempts_at_one_piece_share_nothing(tmp_path: Path) -> None:
+    """A worker that was taken for dead delivers late, while the retry delivers the same files."""
+    names = [f"piece_{k}.ply" for k in range(20)]
+
+    def attempt(number: int) -> None:
+        for _ in range(10):
+            with export_folder(str(tmp_path), BATCH) as made:
+                for name in names:
+                    (made / name).write_bytes(bytes([number]) * 50_000)
+
+    with ThreadPoolExecutor(2) as pool:
+        list(pool.map(attempt, (1, 2)))
+    found = {path.name: path.read_bytes() for path in (tmp_path / "exports").iterdir()}
+    assert sorted(found) == sorted(names), "nothing is left of either"
+    assert all(content in (b"\1" * 50_000, b"\2" * 50_000) for content in found.values()), "each file is of one attempt"
+
+
 def test_what_a_killed_worker_leaves_goes_with_its_batch_alone(tmp_path: Path) -> None:
     exports = tmp_path / "exports"
     exports.mkdir()
