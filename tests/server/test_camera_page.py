@@ -18,7 +18,7 @@ from slviewer.pipeline.capture import capture
 from slviewer.pipeline.reconstruct import reconstruct
 from slviewer.pipeline.rig_choice import RigSetup
 from slviewer.server.device_pages import serve_device_pages
-from slviewer.server.secure import SafeServer
+from slviewer.server.secure import SafeServer, Serving, serve
 from slviewer.simulation.rig import letter
 from slviewer.validation.bench_live import true_calibration
 
@@ -166,3 +166,22 @@ def test_a_scan_by_a_phone_measures_the_plane(phone, film, server, channel, tmp_
     page.close()
     assert 0.3 < rms_mm["simulated"] < 0.8, "mm, of 4 steps at a quarter of the resolution"
     assert 0.97 < rms_mm["phone"] / rms_mm["simulated"] < 1.2, rms_mm
+
+
+def test_the_page_works_encrypted_by_the_certificate_made_here(phone, film, tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
+    server, pages = serve(Serving(port=0, tls=True)), PageChannels()
+    serve_device_pages(server, pages)
+    context = phone.new_context(ignore_https_errors=True)  # as a person who has compared the fingerprint
+    try:
+        context.new_page().goto(server.link("camera"))
+        assert server.link("camera").startswith("https:") and pages.camera.wait_ready(10.0).size == SIZE
+        camera, out = BrowserCamera(page=pages.camera), np.empty(SIZE[::-1], np.uint8)
+        camera.open()
+        film.show(np.full(SIZE[::-1], 200, np.uint8))
+        camera.grab(out)
+        camera.close()
+        assert np.abs(out.astype(int) - 200).max() <= 2
+    finally:
+        context.close()
+        server.stop()
