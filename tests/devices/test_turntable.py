@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from gcode_controller import Controller, Fault
 
-from slviewer.devices.channel import Channel
+from slviewer.devices.browser import PageChannels
 from slviewer.devices.grbl import ALARMS, ERRORS, GcodeTurntable
 from slviewer.devices.protocols import Turntable
 from slviewer.devices.simulated import SimulatedTurntable
@@ -223,5 +223,5 @@ def test_the_shipped_rig_has_a_turntable_with_something_to_see_on_it() -> None:
     camera, projector = {"driver": "opencv", "source": 0, "size": [64, 48]}, {"driver": "browser", "size": [9, 9]}
     with pytest.raises(InputError, match="simulated"):
         set_up(
-            {"camera": camera, "projector": projector, "turntable": {"driver": "simulated"}}, None, channel=Channel()
+            {"camera": camera, "projector": projector, "turntable": {"driver": "simulated"}}, None, pages=PageChannels()
         )

@@ -251,8 +251,7 @@ def test_a_part_is_measured_and_compared_with_its_nominal(
     expect(page.get_by_text(re.compile(rf"{quantities_of(width)[0].value:.3f} ±\s0\.\d+\smm")).first).to_be_visible()
 
     tool(page, "Section", "Click the start of the section.")
-    page.mouse.click(480, 440)
-    page.get_by_text("Click the end of the section").wait_for()
+    click_until(page, (480, 440), "Click the end of the section")
     page.mouse.click(590, 420)
     came(operator, 2)
     expect(page.get_by_text("height difference A – B")).to_be_visible()

@@ -156,7 +156,7 @@ def test_devices_says_what_there_is(run: Run):
     for line in (
         "simulated (turntable, rig)",
         "grbl (turntable)",
-        "browser (projector)",
+        "browser (camera, projector)",
         "needs the projector page",
         "rigs:",
         "  replay: Recorded",
