@@ -10,6 +10,7 @@ import numpy as np
 from slviewer.errors import InputError
 from slviewer.fringe.sequence import Axis
 from slviewer.simulation.boards import FLAT, BoardScene, BoardShape, Pose, blank_board, printed_board
+from slviewer.simulation.concave import CONCAVE
 from slviewer.simulation.decals import MarkedScene, marked_plate
 from slviewer.simulation.mesh import MeshScene, demo_object
 from slviewer.simulation.renderer import Renderer
@@ -18,11 +19,12 @@ from slviewer.simulation.scenes import Scene, Spheres, sphere
 from slviewer.simulation.turning import turn_pose, turning
 from slviewer.target.board import Board
 
-Thing = Literal["board", "plane", "sphere", "object", "stone", "marked"]
+Thing = Literal["board", "plane", "sphere", "object", "stone", "marked", "groove", "bowl", "wax"]
 """The printed target, the blank plate, the Letter's sphere, the demo object, the stone on the turntable, a plate with
-coded markers."""
+coded markers, and three surfaces that light themselves."""
 
 _INITIAL_DEPTHS_MM = {"board": 600.0, "plane": 600.0, "sphere": 690.0, "object": 600.0, "marked": 600.0}
+_INITIAL_DEPTHS_MM |= dict.fromkeys(CONCAVE, 640.0)
 _SETTLED_S = 0.3  # a thing that has not been moved for so long is rendered in full by a preview too
 _DRAFT_SCALE = 0.25  # of a preview while things move: the geometry of 400x300 rays instead of 1600x1200
 
@@ -188,6 +190,8 @@ def _make_scene(thing: Thing) -> Scene:
     """Return the scene of a thing that is made when it is first placed, at its initial pose."""
     if thing == "marked":
         return marked_plate(_make_initial_pose(thing))
+    if thing in CONCAVE:
+        return CONCAVE[thing](_make_initial_pose(thing))
     return demo_object(_make_initial_pose(thing)) if thing == "object" else turning(1)["turn_01"]
 
 

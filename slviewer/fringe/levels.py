@@ -88,6 +88,10 @@ def plan_levels(periods_px: tuple[float, ...], extent: float) -> tuple[Level, ..
     singles = [_combine_periods(periods_px, {i: 1}) for i in range(len(periods_px))]
     if periods_px[0] >= extent:
         return tuple(singles)
+    every = [_combine_periods(periods_px, {j: 1, i: -1}) for i, j in combinations(range(len(periods_px)), 2)]
+    covering = [beat for beat in every if extent <= beat.period_px < np.inf]
+    if len(periods_px) > LONGEST and covering:
+        return (*_chain_beats(min(covering, key=lambda level: level.period_px), every, singles[0]), *singles)
     count = min(LONGEST, len(periods_px))
     beats = [_combine_periods(periods_px, {j: 1, i: -1}) for i, j in combinations(range(count), 2)]
     covering = [beat for beat in beats if beat.period_px >= extent]
@@ -103,6 +107,19 @@ def plan_levels(periods_px: tuple[float, ...], extent: float) -> tuple[Level, ..
     raise InputError(
         f"fringe periods of {_join_periods(periods_px)} px tell only {reached:.0f} px apart, not {extent:g}"
     )
+
+
+def _chain_beats(longest: Level, beats: list[Level], single: Level) -> tuple[Level, ...]:
+    """Return levels from ``longest`` down to above ``single``: of the beats those between which the largest ratio of
+    periods, and then the number of levels, is least."""
+    nodes = sorted({b for b in beats if single.period_px < b.period_px < longest.period_px}, key=lambda b: -b.period_px)
+    best: list[tuple[float, int, tuple[Level, ...]]] = []
+    for level in (longest, *nodes, single):
+        options = [
+            (max(ratio, path[-1].period_px / level.period_px), length + 1, (*path, level)) for ratio, length, path in best
+        ]
+        best.append(min(options, key=lambda option: option[:2]) if options else (1.0, 0, (level,)))
+    return best[-1][2][:-1]
 
 
 def unwrap_levels(

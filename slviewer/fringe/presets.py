@@ -7,6 +7,8 @@ from slviewer.errors import InputError
 from slviewer.fringe.sequence import Axis, Frame, PatternSequence
 
 AXES: tuple[Axis, ...] = ("x", "y")
+MICRO_PX = (12.0, 16.0)
+"""Shortest period of micro phase shifting, and about the longest."""
 
 
 def p18(projector: tuple[int, int]) -> PatternSequence:
@@ -57,6 +59,27 @@ def multifrequency(
     return PatternSequence(projector, (*frames, Frame("texture")))
 
 
+def micro(projector: tuple[int, int], periods: int = 4) -> PatternSequence:
+    """Return phase steps at several periods from 12 to about 16 px, for surfaces that light themselves; x, y, white.
+
+    Micro phase shifting (Gupta and Nayar, "Micro phase shifting", CVPR 2012): light that reaches a point by way of
+    other surfaces, or through the material, averages over such narrow stripes and shifts no phase. There is no long
+    period and no Gray code that it could mislead; beats of the periods replace them. The beats' ratios are equal, so
+    that no unwrapping step is weaker than the others. Eight steps of the finest period, four of the others.
+    """
+    if not 3 <= periods <= 6:
+        raise InputError(f"micro phase shifting with {periods} periods is not offered: choose 3 to 6")
+    frames: list[Frame] = []
+    for axis, extent in zip(AXES, projector, strict=True):
+        longest = max(1.1 * extent, 32.0)
+        ratio = (longest / MICRO_PX[1]) ** (1 / (periods - 1))
+        differences = [1 / (longest / ratio**k) for k in range(periods - 1)]  # of neighbouring frequencies
+        frequencies = [1 / MICRO_PX[0] - sum(differences[k:]) for k in range(periods)]
+        for i, frequency in enumerate(frequencies):
+            frames += phase_steps(axis, 8 if i == periods - 1 else 4, 1 / frequency)
+    return PatternSequence(projector, (*frames, Frame("texture")))
+
+
 def short(projector: tuple[int, int], axis: Axis) -> PatternSequence:
     """Return 11 frames of one axis, for live scanning: 3 + 3 + 4 phase steps of three periods, then white.
 
@@ -79,6 +102,7 @@ PRESETS: dict[str, Callable[[tuple[int, int]], PatternSequence]] = {
     "gray": gray,
     "complementary": complementary,
     "multifrequency": multifrequency,
+    "micro": micro,
 }
 
 

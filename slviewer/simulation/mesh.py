@@ -41,18 +41,16 @@ class MeshScene:
         """Return the first triangle that each ray meets; back faces are ignored."""
         shape = rays.shape[:2]
         directions = np.concatenate([rays, np.ones((*shape, 1))], -1)
-        origin_and_way = np.concatenate([np.zeros_like(directions), directions], -1).astype(np.float32)
-        hits = self._caster.cast_rays(open3d().core.Tensor(origin_and_way))
-        index = hits["primitive_ids"].numpy()
-        hit = np.isfinite(hits["t_hit"].numpy())
+        index, uvs = self.cast(rays)
+        hit = index >= 0
         corners = self.triangles[index[hit]]
         a, b, c = (self.placed[corners[:, k]] for k in range(3))
         flat = np.cross(b - a, c - a)
         along = directions[hit]
         facing = (flat * along).sum(-1)
         points = along * ((flat * a).sum(-1) / facing)[:, None]
-        s, t = hits["primitive_uvs"].numpy()[hit].T[..., None].astype(float)
-        n = self._compute_normals
+        s, t = uvs[hit].T[..., None]
+        n = self.vertex_normals
         smooth = (1 - s - t) * n[corners[:, 0]] + s * n[corners[:, 1]] + t * n[corners[:, 2]]
         smooth /= np.linalg.norm(smooth, axis=-1, keepdims=True)
         front = facing < 0
@@ -60,6 +58,14 @@ class MeshScene:
         surface = Surface(np.full((*shape, 3), np.nan), np.full((*shape, 3), np.nan), np.zeros(shape, np.float32))
         surface.points[hit], surface.normals[hit], surface.albedo[hit] = points[front], smooth[front], self.albedo
         return surface
+
+    def cast(self, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return (h, w) int: the triangle, of either side, that each ray meets, -1 for none; (h, w, 2): where on it."""
+        directions = np.concatenate([rays, np.ones((*rays.shape[:2], 1))], -1)
+        origin_and_way = np.concatenate([np.zeros_like(directions), directions], -1).astype(np.float32)
+        hits = self._caster.cast_rays(open3d().core.Tensor(origin_and_way))
+        met = np.isfinite(hits["t_hit"].numpy())
+        return np.where(met, hits["primitive_ids"].numpy().astype(np.int64), -1), hits["primitive_uvs"].numpy().astype(float)
 
     def occluded(self, points: np.ndarray, source: np.ndarray) -> np.ndarray:
         """Return whether the mesh is between `points` and `source`."""
@@ -69,7 +75,7 @@ class MeshScene:
         return self._caster.test_occlusions(open3d().core.Tensor(cast), 0.0, 1.0).numpy()
 
     @cached_property
-    def _compute_normals(self) -> np.ndarray:
+    def vertex_normals(self) -> np.ndarray:
         """Unit normals (n, 3) of the vertices in the camera frame, averaged over triangles by area."""
         corners = self.placed[self.triangles]
         flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])  # twice the area: a fair weight

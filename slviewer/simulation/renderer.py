@@ -6,10 +6,12 @@ from functools import cached_property
 
 import numpy as np
 from scipy.ndimage import correlate1d
+from scipy.sparse import csr_matrix
 
 from slviewer.errors import InputError
 from slviewer.fringe.patterns import profile
 from slviewer.fringe.sequence import Axis, PatternSequence
+from slviewer.simulation.concave import ConcaveScene
 from slviewer.simulation.film import NORMAL_QUANTILES, digitise, image_light, psf_taps
 from slviewer.simulation.light import OVERSAMPLING, blur_levels, blurred_profile, window
 from slviewer.simulation.rig import SimulatedRig
@@ -59,6 +61,7 @@ class Renderer:
     def __init__(self, rig: SimulatedRig, scene: Scene) -> None:
         self.rig = rig
         self.scene = scene
+        self._indirect: dict[Axis, np.ndarray] = {}
         self._lights: dict[float, tuple[np.ndarray, np.ndarray]] = {}
 
     def truth(self) -> Truth:
@@ -120,14 +123,39 @@ class Renderer:
         illuminated, stray = self._light(self.exposure if exposure is None else exposure)
         # Rows and columns are blurred alike in space, hence by different numbers of pixels.
         sigmas = maps.sigmas * (self._rows_per_column if varies == "y" else 1.0)
-        light = blurred_profile((grey_levels / 255.0) ** rig.light.gamma, sigmas)
+        light_levels = (grey_levels / 255.0) ** rig.light.gamma
+        light = blurred_profile(light_levels, sigmas)
         width, height = rig.camera.size
         out = np.empty((height, width), np.float32)
         image_light(
             maps.coordinates[varies or "x"], maps.level, illuminated, np.float32(lamp) * light.table, light.offset,
             OVERSAMPLING, self._taps, stray, out,
         )  # fmt: skip
+        if isinstance(self.scene, ConcaveScene):
+            profile_light = (1 - rig.light.black) * light_levels
+            out += np.float32(lamp * (self.exposure if exposure is None else exposure)) * self._indirect_light(
+                varies or "x", profile_light
+            )
         return out
+
+    def _indirect_light(self, axis: Axis, profile_light: np.ndarray) -> np.ndarray:
+        """Light at unit exposure, (h, w) float32, that the surface throws on itself under a profile (n,) in 0 ... 1.
+
+        The camera's PSF is left out: this light varies slowly.
+        """
+        if axis not in self._indirect:
+            assert isinstance(self.scene, ConcaveScene)
+            self._indirect[axis] = self.scene.light_matrix(self.rig, axis)
+        values = self._indirect[axis] @ profile_light.astype(np.float32)
+        width, height = self.rig.camera.size
+        weights, reflected = self._pixel_weights
+        return (weights @ values).reshape(height, width) * reflected
+
+    @cached_property
+    def _pixel_weights(self) -> tuple[csr_matrix, np.ndarray]:
+        """Weights of vertices (h w, n) at each pixel, and the light reflected of what it receives, (h, w) float32."""
+        assert isinstance(self.scene, ConcaveScene)
+        return self.scene.pixel_weights(self.rig.camera.rays(0)), self._maps.even[self._frame]
 
     def room_light(self) -> np.ndarray:
         """(h, w) float32: grey levels of even room light as strong as full white light from the projector."""
@@ -154,7 +182,10 @@ class Renderer:
     def exposure(self) -> float:
         """Grey levels of full white light on an albedo of 1 that faces the projector at its focus."""
         maps, sensor = self._maps, self.rig.sensor
-        illuminated = (maps.gain + self.rig.light.ambient * maps.even)[self._frame][maps.truth.mask]
+        light = (maps.gain + self.rig.light.ambient * maps.even)[self._frame]
+        if isinstance(self.scene, ConcaveScene):
+            light = light + self._indirect_light("x", np.ones(self.rig.projector.size[0]))
+        illuminated = light[maps.truth.mask]
         if not illuminated.size:
             raise InputError("nothing in the scene is illuminated by the projector: move it to where both fields meet")
         return (sensor.peak_level - sensor.dark_level) / float(np.quantile(illuminated, _EXPOSURE_QUANTILE))
@@ -200,8 +231,9 @@ class Renderer:
         with np.errstate(invalid="ignore"):
             inside = (u > -0.5) & (u < columns - 0.5) & (v > -0.5) & (v < rows - 0.5)
         sigmas, level = blur_levels(blur)
+        surface_share = 1 - self.scene.indirect.scattered if isinstance(self.scene, ConcaveScene) else 1.0
         return _Maps(
-            gain=(reflected * shade * reached * illuminated).astype(np.float32),
+            gain=(surface_share * reflected * shade * reached * illuminated).astype(np.float32),
             even=(reflected * hit).astype(np.float32),
             level=level,
             sigmas=sigmas,

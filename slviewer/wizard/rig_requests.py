@@ -178,7 +178,7 @@ class RigRequests(RequestHandler):
 
     @request("Placing")
     def place(self, thing: Thing, T_camera_object: np.ndarray | None = None) -> None:
-        """Place "board", "plane", "sphere" or "object" in front of the simulated rig.
+        """Place a thing of `devices.world`, such as "board" or "sphere", in front of the simulated rig.
 
         At T_camera_object (4, 4) mm, or where it was.
         """

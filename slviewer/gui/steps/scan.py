@@ -32,6 +32,7 @@ from slviewer.gui.widgets import (
     to_html,
 )
 from slviewer.report.maps import error_limit
+from slviewer.simulation.concave import CONCAVE
 from slviewer.wizard.result_views import AlignedScans, ScanCloud, aligned_scans, scan_cloud
 from slviewer.wizard.snapshot import LiveView, PreviewView, ScanView, Snapshot
 
@@ -82,7 +83,9 @@ class Panel(StepPanel):
             )
             self._live_status = Text(gui)
             self._turn = TurnInputs(context)
-            self._simulated = SimulatedObject(context, LAYER, ("object", "stone", "marked", "sphere", "plane"))
+            self._simulated = SimulatedObject(
+                context, LAYER, ("object", "stone", "marked", "sphere", "plane", *CONCAVE)
+            )
         self._gallery = Text(gui)
         with gui.add_folder("Cloud", visible=False) as self._cloud_folder:
             self._scan = Choice(gui, "Scan")

@@ -1,0 +1,250 @@
+"""Surfaces that light themselves: a V-groove and a bowl with interreflections, and wax in which light scatters.
+
+The light that a surface receives from itself is linear in the projected pattern. It is computed once per scene as a
+matrix from projector columns, or rows, to vertices, and multiplied by the profile of each frame. Radiosity of patches:
+Goral et al., "Modeling the interaction of light between diffuse surfaces", SIGGRAPH 1984; form factors from a point
+to a polygon: Lambert's formula; glossy lobes: Phong's, normalised.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from scipy.sparse import csr_matrix
+
+from slviewer.errors import InputError
+from slviewer.fringe.sequence import Axis
+from slviewer.simulation.boards import Pose
+from slviewer.simulation.light import window
+from slviewer.simulation.mesh import MeshScene
+from slviewer.simulation.rig import SimulatedRig
+
+_SAMPLES = 8
+"""Samples of the pattern along each side of a patch: patches are wider than a stripe is fine."""
+_FINEST_MM, _COARSEST_MM = 0.3, 3.0
+"""Width of patches at a fold and far from it."""
+
+
+@dataclass(frozen=True)
+class Indirect:
+    """Light that reaches a surface from itself.
+
+    ``bounces``: 0 to 2 reflections between patches. ``gloss``: share of the reflected light that forms a lobe about
+    the mirrored direction, of Phong's ``exponent``; the rest is diffuse, as is all light after the first bounce.
+    ``scattered``: share of the light that enters the material, and leaves it ``reach_mm`` away in the mean.
+    """
+
+    bounces: int = 2
+    gloss: float = 0.0
+    exponent: float = 20.0
+    scattered: float = 0.0
+    reach_mm: float = 2.0
+
+    def __post_init__(self) -> None:
+        if self.bounces not in (0, 1, 2):
+            raise InputError(f"{self.bounces} bounces cannot be simulated: choose 0, 1 or 2")
+        if not (0 <= self.gloss <= 1 and 0 <= self.scattered <= 1 and self.exponent > 0 and self.reach_mm > 0):
+            raise InputError("gloss and scattered light are shares from 0 to 1; exponent and reach must be above 0")
+
+
+@dataclass(frozen=True, eq=False)
+class ConcaveScene(MeshScene):
+    """A mesh of quadrilateral patches (m, 4) each of which sees all others in front of it, and its indirect light."""
+
+    patches: np.ndarray = field(default_factory=lambda: np.zeros((0, 4), int))
+    indirect: Indirect = field(default_factory=Indirect)
+
+    def light_matrix(self, rig: SimulatedRig, axis: Axis) -> np.ndarray:
+        """Return (n, extent) float32: irradiance of each vertex by the surface itself, per projector column or row.
+
+        In the unit of the renderer's direct light; its sum over the columns is that in full white light.
+        """
+        received = self._direct_matrix(rig, axis)
+        total = np.zeros((len(self.vertices), received.shape[1]), np.float32)
+        light = self.indirect
+        if light.scattered:
+            total += light.scattered * (self._scattering @ received)
+        if light.bounces:
+            first = (self._form_factors * self._lobe(rig)) @ received
+            total += first
+            if light.bounces == 2:
+                total += self._form_factors @ (self.albedo * first[self.patches].mean(axis=1))
+        return total
+
+    def pixel_weights(self, rays: np.ndarray) -> csr_matrix:
+        """Return the (h w, n) weights that interpolate values of vertices at the points that rays (h, w, 2) meet."""
+        index, uv = self.cast(rays)
+        pixel = np.flatnonzero(index >= 0)
+        s, t = uv.reshape(-1, 2)[pixel].T
+        corners = self.triangles[index.ravel()[pixel]]
+        weights = np.stack([1 - s - t, s, t], axis=1)
+        shape = (index.size, len(self.vertices))
+        return csr_matrix((weights.ravel(), (np.repeat(pixel, 3), corners.ravel())), shape=shape, dtype=np.float32)
+
+    def _direct_matrix(self, rig: SimulatedRig, axis: Axis) -> np.ndarray:
+        """Return (m, extent) float32: mean irradiance of each patch by each projector column or row.
+
+        Each patch is sampled at many places, so that stripes narrower than a patch are averaged rather than aliased.
+        """
+        corners = self.placed[self.patches]
+        normal, _ = _normals_and_areas(corners)
+        k = (np.arange(_SAMPLES) + 0.5) / _SAMPLES
+        a, b = (each.ravel()[:, None] for each in np.meshgrid(k, k))
+        weights = np.stack([(1 - a) * (1 - b), a * (1 - b), a * b, (1 - a) * b])[..., 0]  # (4, samples)
+        points = np.einsum("mkd,ks->msd", corners, weights)
+        way = rig.projector_centre - points
+        distance = np.linalg.norm(way, axis=-1)
+        facing = np.clip((way * normal[:, None]).sum(-1) / distance, 0, None)
+        shade = facing * (rig.light.focus_mm / distance) ** 2
+        shade[shade > 0] *= ~self.occluded(points[shade > 0], rig.projector_centre)
+        u, v = np.moveaxis(rig.project(points), -1, 0)
+        columns, rows = rig.projector.size
+        blur = np.full(u.shape, rig.light.blur_px)
+        shade *= window(u, columns, blur) * window(v, rows, blur) / weights.shape[1]
+        coordinate, extent = (u, columns) if axis == "x" else (v, rows)
+        place = np.clip(np.nan_to_num(coordinate), 0, extent - 1.001)
+        left = place.astype(int)
+        share = place - left
+        out = np.zeros((len(corners), extent), np.float32)
+        patch = np.repeat(np.arange(len(corners)), weights.shape[1])
+        np.add.at(out, (patch, left.ravel()), (shade * (1 - share)).ravel())
+        np.add.at(out, (patch, left.ravel() + 1), (shade * share).ravel())
+        return out
+
+    @cached_property
+    def _form_factors(self) -> np.ndarray:
+        """(n, m) float32 in 0 ... 1: irradiance of each vertex by each patch of radiosity 1, by Lambert's formula."""
+        normals = self.vertex_normals
+        corners = self.placed[self.patches]
+        facing, _ = _normals_and_areas(corners)
+        out = np.zeros((len(normals), len(corners)), np.float32)
+        for first in range(0, len(normals), 256):
+            some = slice(first, first + 256)
+            at = self.placed[some, None, None]
+            to = corners[None] - at
+            size = np.linalg.norm(to, axis=-1, keepdims=True)
+            beside = (size < 1e-6).any(axis=(2, 3))  # of its own patches a vertex receives nothing
+            to /= np.maximum(size, 1e-9)
+            after = np.roll(to, -1, axis=2)
+            across = np.cross(to, after)
+            sine = np.linalg.norm(across, axis=-1)
+            angle = np.arctan2(sine, (to * after).sum(-1)) / np.maximum(sine, 1e-12)
+            factor = np.abs((angle[..., None] * across).sum(2) @ normals[some, :, None])[..., 0] / (2 * np.pi)
+            middle = corners.mean(axis=1)[None] - at[:, :, 0]
+            visible = ((middle * normals[some, None]).sum(-1) > 0) & ((middle * facing[None]).sum(-1) < 0)
+            out[some] = np.where(visible & ~beside, factor, 0)
+        return out
+
+    def _lobe(self, rig: SimulatedRig) -> np.ndarray:
+        """Return (n, m) float32: radiosity of each patch as each vertex sees it, per irradiance by the projector."""
+        light = self.indirect
+        if not light.gloss:
+            return np.full((1, 1), self.albedo, np.float32)
+        corners = self.placed[self.patches]
+        normal, _ = _normals_and_areas(corners)
+        middle = corners.mean(axis=1)
+        source = _unit(rig.projector_centre - middle)
+        mirrored = 2 * (source * normal).sum(-1, keepdims=True) * normal - source
+        way = _unit(self.placed[:, None] - middle[None])
+        cosine = np.clip((way * mirrored[None]).sum(-1), 0, 1)
+        lobe = (light.exponent + 2) / 2 * cosine**light.exponent
+        return (self.albedo * (1 - light.gloss + light.gloss * lobe)).astype(np.float32)
+
+    @cached_property
+    def _scattering(self) -> np.ndarray:
+        """(n, m) float32: share of the light on a patch that leaves at a vertex, exponential in their distance."""
+        corners = self.placed[self.patches]
+        _, area = _normals_and_areas(corners)
+        distance = np.linalg.norm(self.placed[:, None] - corners.mean(axis=1)[None], axis=-1)
+        length = self.indirect.reach_mm / 2  # the mean distance of exp(-r / length) over a plane is twice its length
+        return (area / (2 * np.pi * length**2) * np.exp(-distance / length)).astype(np.float32)
+
+
+def groove(
+    pose: Pose, angle_deg: float = 90.0, albedo: float = 0.8, indirect: Indirect = Indirect(),
+    width_mm: float = 60.0, length_mm: float = 90.0,
+) -> ConcaveScene:  # fmt: skip
+    """Return a V-groove: two walls of ``width_mm`` that meet at ``angle_deg`` in a fold along y, open towards -z."""
+    if not 20 <= angle_deg <= 170:
+        raise InputError(f"a groove of {angle_deg:g} degrees cannot be simulated: choose 20 to 170")
+    half = np.radians(angle_deg / 2)
+    away = _graded_steps(width_mm)
+    along = np.linspace(-length_mm / 2, length_mm / 2, int(np.ceil(length_mm / _COARSEST_MM)) + 1)
+    walls = [
+        (np.stack([side * away * np.sin(half), -away * np.cos(half)])[:, ::side], along) for side in (-1, 1)
+    ]  # fmt: skip
+    vertices, patches = [], []
+    for (x, z), y in walls:
+        grid = np.stack(np.broadcast_arrays(x[:, None], y[None], z[:, None]), axis=-1)
+        patches.append(_grid_patches(grid.shape[:2]) + sum(map(len, vertices)))
+        vertices.append(grid.reshape(-1, 3))
+    return _make_scene(np.concatenate(vertices), np.concatenate(patches), pose, albedo, indirect)
+
+
+def bowl(
+    pose: Pose, radius_mm: float = 60.0, opening_deg: float = 70.0, albedo: float = 0.8,
+    indirect: Indirect = Indirect(),
+) -> ConcaveScene:  # fmt: skip
+    """Return the inside of a sphere, up to ``opening_deg`` from its deepest point, which is the origin; open to -z."""
+    if not 10 <= opening_deg <= 90:
+        raise InputError(f"a bowl open to {opening_deg:g} degrees cannot be simulated: choose 10 to 90")
+    edge = radius_mm * np.sin(np.radians(opening_deg))
+    side = np.linspace(-1, 1, 2 * int(np.ceil(edge / 2.0)) + 1)
+    a, b = np.meshgrid(side, side, indexing="ij")
+    # A square onto a disc, so that patches are alike everywhere.
+    x, y = a * np.sqrt(1 - b**2 / 2), b * np.sqrt(1 - a**2 / 2)
+    polar = np.radians(opening_deg) * np.hypot(x, y)
+    share = np.where(polar > 0, np.sin(polar) / np.maximum(np.hypot(x, y), 1e-12), 0) * radius_mm
+    grid = np.stack([x * share, y * share, radius_mm * (np.cos(polar) - 1)], axis=-1)
+    return _make_scene(grid.reshape(-1, 3), _grid_patches(a.shape), pose, albedo, indirect)
+
+
+def wax(pose: Pose, size_mm: float = 90.0, relief_mm: float = 4.0, indirect: Indirect | None = None) -> ConcaveScene:
+    """Return a wavy plate of wax, in which 60 % of the light scatters, facing -z."""
+    side = np.linspace(-size_mm / 2, size_mm / 2, int(np.ceil(size_mm / 1.5)) + 1)
+    x, y = np.meshgrid(side, side, indexing="ij")
+    z = relief_mm * np.sin(2 * np.pi * x / 45) * np.cos(2 * np.pi * y / 60)
+    light = Indirect(0, scattered=0.6, reach_mm=3.0) if indirect is None else indirect
+    return _make_scene(np.stack([x, y, z], axis=-1).reshape(-1, 3), _grid_patches(x.shape), pose, 0.8, light)
+
+
+CONCAVE: dict[str, Callable[[Pose], ConcaveScene]] = {"groove": groove, "bowl": bowl, "wax": wax}
+"""The surfaces by the names under which they are placed before the simulated rig."""
+
+
+def _make_scene(
+    vertices: np.ndarray, patches: np.ndarray, pose: Pose, albedo: float, indirect: Indirect
+) -> ConcaveScene:  # fmt: skip
+    """Return the scene of patches, each of two triangles; raises InputError for an albedo beyond 0 ... 1."""
+    if not 0 < albedo < 1:
+        raise InputError(f"an albedo of {albedo:g} cannot be simulated: choose one between 0 and 1")
+    triangles = np.concatenate([patches[:, [0, 1, 2]], patches[:, [0, 2, 3]]])
+    return ConcaveScene(vertices, triangles, pose, albedo, patches, indirect)
+
+
+def _graded_steps(width: float) -> np.ndarray:
+    """Return distances (n,) mm from a fold, 0 to ``width``: in fine steps first, which grow."""
+    steps = [0.0]
+    while steps[-1] < width:
+        steps.append(steps[-1] + np.clip(0.15 * steps[-1], _FINEST_MM, _COARSEST_MM))
+    return np.array(steps) * (width / steps[-1])
+
+
+def _grid_patches(shape: tuple[int, ...]) -> np.ndarray:
+    """Return (m, 4) vertex indices of the cells of a grid whose x and y grow, in order, facing -z."""
+    index = np.arange(shape[0] * shape[1]).reshape(shape)
+    corners = index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]
+    return np.stack([each.ravel() for each in corners], axis=1)
+
+
+def _normals_and_areas(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return unit normals (m, 3) and areas (m,) mm^2 of patches with corners (m, 4, 3)."""
+    twice = np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])
+    size = np.linalg.norm(twice, axis=-1)
+    return twice / size[:, None], size / 2
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    """Return vectors (..., 3) of length 1."""
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)
