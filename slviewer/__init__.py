@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from slviewer.fringe.decode import decode, texture
     from slviewer.fringe.description_check import check_description
     from slviewer.fringe.phase import PhaseMap
-    from slviewer.fringe.presets import complementary, gray, multifrequency, p18
+    from slviewer.fringe.presets import complementary, gray, micro, multifrequency, p18
     from slviewer.fringe.sequence import Frame, PatternSequence
     from slviewer.pipeline.calibrate import CalibrationResult, calibrate, calibrate_frames, save_calibration
     from slviewer.pipeline.import_captures import import_captures, read_captures
@@ -92,6 +92,7 @@ _EXPORTS = {
     "merge": "pipeline.merge",
     "mesh": "pipeline.mesh",
     "mesh_cloud": "surface.meshing:build_mesh",
+    "micro": "fringe.presets",
     "multifrequency": "fringe.presets",
     "p18": "fringe.presets",
     "read_captures": "pipeline.import_captures",
@@ -108,7 +109,7 @@ __all__ = [
     "Board", "CalibrationResult", "Cloud", "Frame", "PatternSequence", "PhaseMap", "Session", "SlviewerError",
     "align_clouds", "calibrate", "calibrate_frames", "check_description", "complementary", "decode", "detect_board",
     "draw_error_maps", "evaluate_plane", "evaluate_sphere", "fuse_clouds", "gray", "import_captures",
-    "load_calibration", "measure", "merge", "mesh", "mesh_cloud", "multifrequency", "p18", "read_captures",
+    "load_calibration", "measure", "merge", "mesh", "mesh_cloud", "micro", "multifrequency", "p18", "read_captures",
     "reconstruct", "reconstruct_cloud", "save_calibration", "texture", "verify", "write_ply",
 ]  # fmt: skip
 

@@ -17,14 +17,15 @@ __all__ = ["decode", "decode_reference", "texture"]
 
 
 def decode(
-    sequence: PatternSequence, stack: np.ndarray, axis: Axis, light: FrameLight | None = None
+    sequence: PatternSequence, stack: np.ndarray, axis: Axis, light: FrameLight | None = None, *,
+    mask_indirect: bool = True,
 ) -> PhaseMap:  # fmt: skip
     """Decode the phase map of one axis from the (n, h, w) uint8 or uint16 frames of a sequence.
 
     A pixel is masked, with a reason, rather than given a doubtful phase. Where the light differed between the frames
     (see `frame_light`), they are decoded as they would be under equal light; the phase error that gamma causes with
     three or four steps (see `aliased_harmonics`) is corrected. ``light``: from `estimate_frame_light`; estimated if
-    None. Raises InputError when the frames are not those of the sequence, or cannot give an absolute phase.
+    None. ``mask_indirect``: mask pixels of much indirect light, see `indirect_light`. Raises InputError when the frames are not those of the sequence, or cannot give an absolute phase.
     """
     check_stack(sequence, stack)
     layout = axis_layout(sequence, axis)
@@ -46,7 +47,7 @@ def decode(
         ladder = pack_levels(layout, fringe_mean(layout, stack) if layout.gray else MIDDLE)
         kernels_levels.decode_levels(stack, pack_shifts(layout), ladder, scale, maps)
     _repair_spikes(layout, maps[0], maps[-1])
-    return complete_map(axis, layout, stack, clipped, maps, noise, factor)
+    return complete_map(sequence, layout, stack, clipped, maps, noise, factor, mask_indirect)
 
 
 def texture(sequence: PatternSequence, stack: np.ndarray) -> np.ndarray:

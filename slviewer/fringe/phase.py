@@ -31,6 +31,8 @@ class Reason(IntEnum):
     """A bit that could not be decided, or an order that contradicts the phase or the neighbourhood."""
     OUTSIDE = 4
     """The coordinate lies outside the projector."""
+    INDIRECT = 5
+    """The frames contradict a single reflection: much of the light came from other surfaces or through the material."""
 
 
 @dataclass(frozen=True)

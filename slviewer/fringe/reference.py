@@ -5,6 +5,7 @@ import numpy as np
 from slviewer.fringe import limits
 from slviewer.fringe.aliased_harmonics import correct_harmonics, estimate_aliased_harmonics
 from slviewer.fringe.frame_light import CLIPPED, equalize_axis, restore_levels
+from slviewer.fringe.indirect_light import mask_indirect_light
 from slviewer.fringe.layout import Layout, axis_layout, check_stack, white_level
 from slviewer.fringe.levels import (
     cell_misfit,
@@ -57,23 +58,26 @@ def decode_reference(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -
     ).astype(np.uint8)
     phase[reason != Reason.VALID] = np.nan
     phase, reason = repair_spikes(layout, phase, reason)
-    return complete_map(axis, layout, stack, white, (phase, wrapped, modulation, background, reason), noise, factor)
+    return complete_map(sequence, layout, stack, white, (phase, wrapped, modulation, background, reason), noise, factor)
 
 
 def complete_map(
-    axis: Axis,
+    sequence: PatternSequence,
     layout: Layout,
     stack: np.ndarray,
     white: float,
     maps: tuple[np.ndarray, ...],
     noise: tuple[float, float],
     factor: float,
+    mask_indirect: bool = True,
 ) -> PhaseMap:
     """Return the phase map of decoded ``maps`` (phase, wrapped phase, modulation, background, reason), each (h, w).
 
-    The phase is corrected for gamma, grey levels are divided by the ``factor`` of equalisation, and the scatter of the
+    With ``mask_indirect`` pixels of much indirect light are masked, see `indirect_light`. The phase is corrected for gamma, grey levels are divided by the ``factor`` of equalisation, and the scatter of the
     phase is measured. ``white`` and ``noise`` are those of the ``stack`` that was decoded.
     """
+    if mask_indirect:
+        mask_indirect_light(sequence, layout, stack, white, maps, noise)
     phase, wrapped, modulation, background, reason = maps
     harmonics = estimate_aliased_harmonics(layout, stack, white, noise)
     phase, wrapped = correct_harmonics(harmonics, layout, phase, wrapped)
@@ -81,7 +85,7 @@ def complete_map(
         modulation, background, noise = restore_levels(modulation, background, noise, factor)
     unambiguous = unambiguous_px(layout)
     phase_map = PhaseMap(
-        axis,
+        layout.axis,
         layout.period_px,
         phase,
         wrapped,

@@ -58,7 +58,8 @@ def capture(
         rig: A TOML file that describes the rig, or the name of one that `slviewer devices` lists.
         role: calibration for a target pose, scan for anything else.
         board: What the target is, circles:21x16:9 and the like; by default as the session knows it.
-        patterns: p18, complementary, gray or multifrequency; by default the session's, else complementary.
+        patterns: p18, complementary, gray, multifrequency or micro (for surfaces that light themselves); by default the
+            session's, else complementary.
         exposure_ms: Exposure of the camera; by default the rig's, else what the camera is set to.
         exposures_ms: Two or more exposures for shiny and dark parts; each pixel is used from the longest that does not
             clip it.

@@ -33,6 +33,10 @@ _REASONS = {
         "contradict themselves or their neighbours",
         "keep the scene and the light still, raise the exposure, and check the description of the frames",
     ),
+    Reason.INDIRECT: (
+        "receive much light from other surfaces or through the material",
+        "use the patterns micro, and see docs/difficult-surfaces.md",
+    ),
     Reason.OUTSIDE: ("lie outside the projector", "check the size of the projector and the periods"),
 }
 """Why illuminated pixels do not decode, and what to do."""

@@ -25,6 +25,7 @@ REASONS = {
     Reason.SATURATED: "the camera clipped the patterns",
     Reason.INCONSISTENT: "a bit could not be decided, or the fringe order contradicts the phase or the neighbourhood",
     Reason.OUTSIDE: "the coordinate lies outside of the projector",
+    Reason.INDIRECT: "much of the light came by way of other surfaces or through the material",
 }
 """What the codes of the files `reason_<axis>` stand for."""
 

@@ -15,7 +15,7 @@ def patterns(preset: str, projector: str, out: Path | str) -> str:
     """Write the images of a pattern sequence, and the TOML that `import frames` reads.
 
     Args:
-        preset: p18, complementary, gray or multifrequency.
+        preset: p18, complementary, gray, multifrequency or micro.
         projector: Width x height of the projector, px.
         out: Folder to make.
 

@@ -12,7 +12,7 @@ from slviewer.devices.browser import PAGE_ROLES, PageChannels, PageRole
 from slviewer.devices.drivers import Driver, driver, drivers
 from slviewer.devices.protocols import Rig, Turntable
 from slviewer.devices.simulated import simulated_rig
-from slviewer.devices.world import SimulatedWorld
+from slviewer.devices.world import SimulatedWorld, Thing
 from slviewer.errors import InputError
 from slviewer.pipeline.replay import Reel, reel
 from slviewer.simulation.rig import letter
@@ -113,9 +113,14 @@ def rig_factory(driver: Driver) -> Callable[..., Any] | None:
     return own.get(driver.name, driver.rig)
 
 
-def _simulated_setup(board: Board | None, preset: str = "letter", scale: float = 1.0, seed: int = 0) -> RigSetup:
-    """Return the simulated rig of a preset, with the board in its scene."""
+def _simulated_setup(
+    board: Board | None, preset: str = "letter", scale: float = 1.0, seed: int = 0, thing: Thing = "board"
+) -> RigSetup:
+    """Return the simulated rig of a preset, with a thing of `devices.world`, such as the board, in view."""
     if preset != "letter":
         raise InputError(f"no rig preset is called {preset!r}: use letter")
     rig = letter(scale, seed)
-    return RigSetup(simulated_rig(world := SimulatedWorld(rig, board)), world, rig.camera.focal_px[0] * scale)
+    world = SimulatedWorld(rig, board)
+    if thing != "board":
+        world.place(thing)
+    return RigSetup(simulated_rig(world), world, rig.camera.focal_px[0] * scale)

@@ -106,7 +106,8 @@ def turn(
         resume: Capture what is missing of the turn of that name, by default of the last one.
         merge: Whether to merge the scans and mesh the merge; --no-merge captures only.
         mesh: File of the mesh, .ply, .stl, .obj or .glb; by default a .ply in the session's exports.
-        patterns: p18, complementary, gray or multifrequency; by default the session's, else complementary.
+        patterns: p18, complementary, gray, multifrequency or micro (for surfaces that light themselves); by default the
+            session's, else complementary.
         exposure_ms: Exposure of the camera; by default the rig's, else what the camera is set to.
         exposures_ms: Two or more exposures for shiny and dark parts.
         gain: Gain of the camera, as a factor; by default the rig's, else what the camera is set to.

@@ -16,12 +16,14 @@ REASON_LABELS = {
     Reason.SATURATED: "saturated",
     Reason.INCONSISTENT: "inconsistent",
     Reason.OUTSIDE: "outside of the projector",
+    Reason.INDIRECT: "indirect light",
 }
 REASON_COLOURS = {
     Reason.DARK: "#3a424b",
     Reason.SATURATED: "#e5322d",
     Reason.INCONSISTENT: "#ff8ad8",
     Reason.OUTSIDE: "#ffffff",
+    Reason.INDIRECT: "#ff9a1f",
 }
 """None of them occurs in the colour scale of the coordinates."""
 _AROUND_PX = 96  # titles above, the legend below

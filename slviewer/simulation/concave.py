@@ -174,10 +174,11 @@ def groove(
     walls = [
         (np.stack([side * away * np.sin(half), -away * np.cos(half)])[:, ::side], along) for side in (-1, 1)
     ]  # fmt: skip
-    vertices, patches = [], []
+    vertices: list[np.ndarray] = []
+    patches: list[np.ndarray] = []
     for (x, z), y in walls:
         grid = np.stack(np.broadcast_arrays(x[:, None], y[None], z[:, None]), axis=-1)
-        patches.append(_grid_patches(grid.shape[:2]) + sum(map(len, vertices)))
+        patches.append(_grid_patches(grid.shape[:2]) + sum(len(each) for each in vertices))
         vertices.append(grid.reshape(-1, 3))
     return _make_scene(np.concatenate(vertices), np.concatenate(patches), pose, albedo, indirect)
 

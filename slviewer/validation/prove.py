@@ -12,9 +12,10 @@ from slviewer.validation.prove_edges import prove_edges
 from slviewer.validation.prove_guidance import prove_guidance
 from slviewer.validation.prove_hostile import prove_hostile
 from slviewer.validation.prove_registration import prove_registration
+from slviewer.validation.prove_surfaces import prove_surfaces
 from slviewer.validation.prove_uncertainty import prove_uncertainty
 
-Claim = Literal["accuracy", "causes", "edges", "guidance", "hostile", "registration", "uncertainty"]
+Claim = Literal["accuracy", "causes", "edges", "guidance", "hostile", "registration", "surfaces", "uncertainty"]
 CLAIMS: Mapping[Claim, tuple[str, Callable[..., Proof]]] = {
     "accuracy": ("accuracy at the noise floor", prove_accuracy),
     "causes": ("faults called by their names", prove_causes),
@@ -22,6 +23,7 @@ CLAIMS: Mapping[Claim, tuple[str, Callable[..., Proof]]] = {
     "guidance": ("guided poses", prove_guidance),
     "hostile": ("captures of a hostile rig", prove_hostile),
     "registration": ("scans in one frame", prove_registration),
+    "surfaces": ("surfaces that light themselves", prove_surfaces),
     "uncertainty": ("predicted uncertainty", prove_uncertainty),
 }
 """Of each claim its title and what proves it."""
@@ -69,8 +71,8 @@ def prove(
     Args:
         quick: A quarter of the camera's resolution; its figures are its own.
         only: What to prove: accuracy on planes and spheres, causes of bad calibrations, printed edges, guidance of an
-            operator to good poses, captures of a hostile rig, registration of scans, uncertainty against true errors;
-            by default all.
+            operator to good poses, captures of a hostile rig, registration of scans, surfaces that light themselves,
+            uncertainty against true errors; by default all.
         cases: Of the hostile rig only these faults, such as flicker, jpeg:mild or gamma:severe:scan.
         seed: Another seed proves it on other rigs of the same kinds.
     """

@@ -55,6 +55,7 @@ def test_all_claims_are_proved_and_one_that_fails_is_named(asked, tmp_path, caps
         "guidance": True,
         "hostile": True,
         "registration": True,
+        "surfaces": True,
         "uncertainty": True,
     }
 

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import viser
 
+from slviewer.fringe.presets import PRESETS
 from slviewer.gui.exposures import ExposureInputs
 from slviewer.gui.import_inputs import ImportInputs
 from slviewer.gui.inputs import Choice, RestoreButton, SessionValue, change, display_name
@@ -70,6 +71,13 @@ class Panel(StepPanel):
             self._capture = context.button(
                 "Capture scan", lambda: operator.capture_scan(self._label.value), viser.Icon.CAMERA, None
             )
+            self._patterns = gui.add_dropdown(
+                "Patterns", tuple(PRESETS), hint="micro for concave metal, wax and other surfaces that light themselves"
+            )
+            self._patterns_value = SessionValue(self._patterns)
+            self._patterns.on_update(
+                context.callback(lambda: operator.choose_patterns(self._patterns.value), by_user=True)
+            )
             self._exposures = ExposureInputs(context, for_scan=True)
             self._align = gui.add_checkbox(
                 "Align as you scan", False, hint="Shows each new scan in its place beside those before it"
@@ -130,6 +138,9 @@ class Panel(StepPanel):
             change(self._capture_folder, visible=rig.state != "none")
             change(self._capture, disabled=not ready)
             self._draw_live(snapshot.live, ready)
+            change(self._patterns, disabled=rig.state != "open" or rig.capture is not None)
+            if session is not None:
+                self._patterns_value.update(session.patterns)
             self._exposures.draw(snapshot)
             self._turn.draw(snapshot, ready)
             self._simulated.draw(snapshot)
