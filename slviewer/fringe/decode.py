@@ -22,10 +22,11 @@ def decode(
 ) -> PhaseMap:  # fmt: skip
     """Decode the phase map of one axis from the (n, h, w) uint8 or uint16 frames of a sequence.
 
-    A pixel is masked, with a reason, rather than given a doubtful phase. Where the light differed between the frames
-    (see `frame_light`), they are decoded as they would be under equal light; the phase error that gamma causes with
-    three or four steps (see `aliased_harmonics`) is corrected. ``light``: from `estimate_frame_light`; estimated if
-    None. ``mask_indirect``: mask pixels of much indirect light, see `indirect_light`. Raises InputError when the frames are not those of the sequence, or cannot give an absolute phase.
+    A pixel is masked, with a reason, rather than given a doubtful phase. Where the light differed between the
+    frames (see `frame_light`), they are decoded as they would be under equal light; the phase error that gamma
+    causes with three or four steps (see `aliased_harmonics`) is corrected. ``light``: from `estimate_frame_light`;
+    estimated if None. ``mask_indirect``: mask pixels of much indirect light, see `indirect_light`. Raises
+    InputError when the frames are not those of the sequence, or cannot give an absolute phase.
     """
     check_stack(sequence, stack)
     layout = axis_layout(sequence, axis)

@@ -30,8 +30,12 @@ EDGE_PX = 5.0
 """... and in px: Gray code alone has cells narrower than the blur."""
 FEWEST_STEPS = 4
 """With three steps gamma makes the amplitude of the fringes depend on the phase."""
-WEAK = 0.06
+WEAK = 0.05
 """Share by which fringes are weaker, for their white light, than those of the image, that blur may explain."""
+WEAK_NARROW = 0.5
+"""... where all periods are narrow: indirect light then misleads no fringe order, and is masked where it prevails."""
+NARROW = 2.0
+"""Ratio of the longest to the finest period up to which all are narrow."""
 WINDOW_PX = 7
 """Side of the window in which fringes and white light are averaged: one pixel's noise is no evidence."""
 SAMPLES = 6000
@@ -41,7 +45,7 @@ UPPER = 0.98
 """Weight of the samples above the fit: those below have indirect light."""
 PENALTY = 0.5
 """Of the fit's slopes, in shares of the samples' weight."""
-NOISE_SIGMAS = 6.0
+NOISE_SIGMAS = 4.0
 """Standard deviations of their noise by which fringes must be weaker as well."""
 SPREADS = 1.0
 """Spreads of the samples above the fit by which fringes must be weaker as well."""
@@ -76,8 +80,10 @@ def mask_indirect_light(
     """
     phase, _, modulation, background, reason = maps
     whites = [i for kind in ("texture", "white") for i, frame in enumerate(sequence.frames) if frame.kind == kind]
+    is_narrow = not layout.gray and len(layout.shifts) > 1 and layout.shifts[0].period_px < NARROW * layout.period_px
+    share = WEAK_NARROW if is_narrow else WEAK
     if layout.steps >= FEWEST_STEPS and whites:
-        weak = _detect_weak_fringes(stack[whites[0]], white, phase, modulation, background, reason, noise)
+        weak = _detect_weak_fringes(stack[whites[0]], white, phase, modulation, background, reason, noise, share)
         reason[weak] = Reason.INDIRECT
     if layout.gray:
         _mask_unequal_bits(layout, stack, phase, background, reason, noise)
@@ -98,7 +104,11 @@ def _mask_unequal_bits(
     wide = [k for k, span in enumerate(spans) if span > 4 * guard]
     if len(wide) < 2:
         return
-    bits = np.array([frames[k] for k in wide]), np.array([inverses[k] for k in wide]), np.array([spans[k] for k in wide])
+    bits = (
+        np.array([frames[k] for k in wide]),
+        np.array([inverses[k] for k in wide]),
+        np.array([spans[k] for k in wide]),
+    )
     limits = np.array([layout.period_px / (2 * np.pi), layout.gray_origin_px, guard, *noise], np.float64)
     stack = read_only(stack)
 
@@ -140,7 +150,7 @@ def _compare_bits(stack, first, frames, inverses, spans, limits, phase, backgrou
 
 def _detect_weak_fringes(
     white_frame: np.ndarray, clipped: float, phase: np.ndarray, modulation: np.ndarray, background: np.ndarray,
-    reason: np.ndarray, noise: tuple[float, float],
+    reason: np.ndarray, noise: tuple[float, float], share: float,
 ) -> np.ndarray:  # fmt: skip
     """Return (h, w) bool: valid pixels whose fringes are weak for their white light, compared with the image's.
 
@@ -159,7 +169,7 @@ def _detect_weak_fringes(
         strength = np.where(valid, np.log(fringes / half), np.nan)
         # Mostly of the white frame; the fringes are of several frames.
         own = np.sqrt(np.maximum(noise[0] + noise[1] * (background + half / np.maximum(weight, 0.1)), 0))
-        margin = NOISE_SIGMAS * own * np.sqrt(count) / (half * WINDOW_PX**2) - np.log(1 - WEAK)
+        margin = NOISE_SIGMAS * own * np.sqrt(count) / (half * WINDOW_PX**2) - np.log(1 - share)
     slope = _square_gradient(phase, valid)
     rows, columns = np.nonzero(valid & np.isfinite(strength) & np.isfinite(slope))
     if len(rows) < FEWEST:

@@ -116,7 +116,8 @@ def _chain_beats(longest: Level, beats: list[Level], single: Level) -> tuple[Lev
     best: list[tuple[float, int, tuple[Level, ...]]] = []
     for level in (longest, *nodes, single):
         options = [
-            (max(ratio, path[-1].period_px / level.period_px), length + 1, (*path, level)) for ratio, length, path in best
+            (max(ratio, path[-1].period_px / level.period_px), length + 1, (*path, level))
+            for ratio, length, path in best
         ]
         best.append(min(options, key=lambda option: option[:2]) if options else (1.0, 0, (level,)))
     return best[-1][2][:-1]

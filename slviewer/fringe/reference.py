@@ -73,8 +73,9 @@ def complete_map(
 ) -> PhaseMap:
     """Return the phase map of decoded ``maps`` (phase, wrapped phase, modulation, background, reason), each (h, w).
 
-    With ``mask_indirect`` pixels of much indirect light are masked, see `indirect_light`. The phase is corrected for gamma, grey levels are divided by the ``factor`` of equalisation, and the scatter of the
-    phase is measured. ``white`` and ``noise`` are those of the ``stack`` that was decoded.
+    With ``mask_indirect`` pixels of much indirect light are masked, see `indirect_light`. The phase is corrected
+    for gamma, grey levels are divided by the ``factor`` of equalisation, and the scatter of the phase is measured.
+    ``white`` and ``noise`` are those of the ``stack`` that was decoded.
     """
     if mask_indirect:
         mask_indirect_light(sequence, layout, stack, white, maps, noise)

@@ -65,7 +65,9 @@ class MeshScene:
         origin_and_way = np.concatenate([np.zeros_like(directions), directions], -1).astype(np.float32)
         hits = self._caster.cast_rays(open3d().core.Tensor(origin_and_way))
         met = np.isfinite(hits["t_hit"].numpy())
-        return np.where(met, hits["primitive_ids"].numpy().astype(np.int64), -1), hits["primitive_uvs"].numpy().astype(float)
+        return np.where(met, hits["primitive_ids"].numpy().astype(np.int64), -1), hits["primitive_uvs"].numpy().astype(
+            float
+        )
 
     def occluded(self, points: np.ndarray, source: np.ndarray) -> np.ndarray:
         """Return whether the mesh is between `points` and `source`."""

@@ -69,7 +69,9 @@ def surface_cases() -> dict[str, tuple[Scene, bool]]:
         "sphere": spheres()["sphere_2"],
         "object": objects()["object_r2"],
     }
-    return {name: (scene, True) for name, scene in lit.items()} | {name: (scene, False) for name, scene in clean.items()}
+    return {name: (scene, True) for name, scene in lit.items()} | {
+        name: (scene, False) for name, scene in clean.items()
+    }
 
 
 def prove_surfaces(scale: float = 0.5, *, seed: int = 0, progress: Progress = ignore_progress) -> Proof:
@@ -98,7 +100,9 @@ def prove_surfaces(scale: float = 0.5, *, seed: int = 0, progress: Progress = ig
         if name == JUDGED:
             gain = errors["p18"].rms_mm / errors["micro"].rms_mm
             checks.append(BandCheck(name, "error of p18 over that of micro", gain, LEAST_GAIN, np.inf))
-            checks.append(BandCheck(name, "share of wrong points of p18 masked", errors["p18"].caught, LEAST_CAUGHT, 1.0))
+            checks.append(
+                BandCheck(name, "share of wrong points of p18 masked", errors["p18"].caught, LEAST_CAUGHT, 1.0)
+            )
     progress(1.0, "proven")
     gains = ", ".join(f"{name} {each['p18']['rms_mm'] / each['micro']['rms_mm']:.1f}" for name, each in record.items())
     return prove_checks(checks, scale, rows, {"surfaces": record}, below=[f"p18's RMS over micro's: {gains}"])
