@@ -30,8 +30,9 @@ EDGE_PX = 5.0
 """... and in px: Gray code alone has cells narrower than the blur."""
 FEWEST_STEPS = 4
 """With three steps gamma makes the amplitude of the fringes depend on the phase."""
-WEAK = 0.05
-"""Share by which fringes are weaker, for their white light, than those of the image, that blur may explain."""
+WEAK = 0.35
+"""Share by which fringes are weaker, for their white light, than those of the image, that blur may explain: of fringes of 18 px
+one of 2.6 px. Bits are misread only where indirect light exceeds the direct, and fringes have less than half."""
 WEAK_NARROW = 0.5
 """... where all periods are narrow: indirect light then misleads no fringe order, and is masked where it prevails."""
 NARROW = 2.0
@@ -41,9 +42,9 @@ WINDOW_PX = 7
 SAMPLES = 6000
 """Pixels, evenly spread, that the strength of the image's fringes is fitted to."""
 FEWEST = 200
-UPPER = 0.98
+UPPER = 0.95
 """Weight of the samples above the fit: those below have indirect light."""
-PENALTY = 0.5
+PENALTY = 0.1
 """Of the fit's slopes, in shares of the samples' weight."""
 NOISE_SIGMAS = 4.0
 """Standard deviations of their noise by which fringes must be weaker as well."""

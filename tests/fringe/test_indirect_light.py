@@ -1,5 +1,7 @@
 """Pixels of much indirect light are masked, and those of a single reflection are not."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -14,12 +16,14 @@ from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import letter
 
 RIG = letter(0.3)
+UNSHARP = replace(RIG, light=replace(RIG.light, defocus_px_mm=4 * RIG.light.defocus_px_mm))
 POSE = Pose(rotation(np.radians([0, 10, 0])), np.array([0, 0, 640.0]))
 MISLED = Renderer(RIG, groove(POSE, 70, 0.8))
 CLEAN = {
     "groove": Renderer(RIG, groove(POSE, 70, 0.8, Indirect(0))),
     "plane": Renderer(RIG, planes()["plane_03"]),
     "sphere": Renderer(RIG, spheres()["sphere_2"]),
+    "unsharp sphere": Renderer(UNSHARP, spheres()["sphere_1"]),
 }
 
 
@@ -33,12 +37,12 @@ def test_points_of_a_wrong_period_are_masked_in_a_groove(sequence_of):
     sequence, frames = captured(MISLED, sequence_of)
     plain, masked = (decode(sequence, frames, "x", mask_indirect=each) for each in (False, True))
     truth = MISLED.truth()
-    wrong = plain.mask & truth.mask & (np.abs(plain.coordinate - truth.projector[..., 0]) > 1)
-    assert wrong.sum() > 500
-    assert np.mean(masked.reason[wrong] == Reason.INDIRECT) > 0.9
+    wrong = plain.mask & truth.mask & (np.abs(plain.coordinate - truth.projector[..., 0]) > 5)
+    assert wrong.sum() > 200
+    assert np.mean(masked.reason[wrong] == Reason.INDIRECT) > 0.95
     assert not (plain.reason == Reason.INDIRECT).any()
     assert np.isnan(masked.phase[masked.reason == Reason.INDIRECT]).all()
-    assert 0.2 < masked.mask.sum() / plain.mask.sum() < 0.8
+    assert 0.4 < masked.mask.sum() / plain.mask.sum() < 0.9
 
 
 def test_narrow_stripes_are_masked_only_where_indirect_light_prevails():
