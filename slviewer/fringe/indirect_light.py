@@ -20,8 +20,9 @@ from slviewer.fringe.sequence import PatternSequence
 from slviewer.geometry.jit import kernel, read_only, run_rows
 
 INDIRECT = np.uint8(Reason.INDIRECT)
-BIT_SHARE = 0.2
-"""Difference between the contrasts of a pixel's bits, as a share of the largest, up to which blur explains it."""
+BIT_SHARE = 0.65
+"""Difference between the contrasts of a pixel's bits, as a share of the largest, up to which no bit is misread: that
+takes as much indirect light as direct. Adhesive tape on a board differs by up to a half, and is measured well."""
 BIT_SIGMAS = 8.0
 """... and in standard deviations of a grey level: noise alone does not make such a range."""
 EDGE_CELLS = 0.4
@@ -31,8 +32,8 @@ EDGE_PX = 5.0
 FEWEST_STEPS = 4
 """With three steps gamma makes the amplitude of the fringes depend on the phase."""
 WEAK = 0.35
-"""Share by which fringes are weaker, for their white light, than those of the image, that blur may explain: of fringes of 18 px
-one of 2.6 px. Bits are misread only where indirect light exceeds the direct, and fringes have less than half."""
+"""Share by which fringes are weaker, for their white light, than those of the image, that blur may explain: of fringes
+of 18 px one of 2.6 px. Bits are misread only where indirect light exceeds the direct: fringes have less than half."""
 WEAK_NARROW = 0.5
 """... where all periods are narrow: indirect light then misleads no fringe order, and is masked where it prevails."""
 NARROW = 2.0
@@ -44,8 +45,8 @@ SAMPLES = 6000
 FEWEST = 200
 UPPER = 0.95
 """Weight of the samples above the fit: those below have indirect light."""
-PENALTY = 0.1
-"""Of the fit's slopes, in shares of the samples' weight."""
+PENALTIES = (0.0, 0.1, 0.1, 0.1, 0.02, 0.1)
+"""Of the fit's terms, in shares of the samples' weight; the phase's square alone follows the blur of a deep surface."""
 NOISE_SIGMAS = 4.0
 """Standard deviations of their noise by which fringes must be weaker as well."""
 SPREADS = 1.0
@@ -60,7 +61,7 @@ MOST_SPREAD = 0.1
 
 @dataclass(frozen=True, eq=False)
 class _Sampled:
-    """``strength`` (n,): log of the fringes' amplitude over half of the white light; ``terms`` (n, 5) of its model."""
+    """``strength`` (n,): log of the fringes' amplitude over half of the white light; ``terms`` (n, 6) of its model."""
 
     strength: np.ndarray
     terms: np.ndarray
@@ -82,9 +83,8 @@ def mask_indirect_light(
     phase, _, modulation, background, reason = maps
     whites = [i for kind in ("texture", "white") for i, frame in enumerate(sequence.frames) if frame.kind == kind]
     is_narrow = not layout.gray and len(layout.shifts) > 1 and layout.shifts[0].period_px < NARROW * layout.period_px
-    share = WEAK_NARROW if is_narrow else WEAK
     if layout.steps >= FEWEST_STEPS and whites:
-        weak = _detect_weak_fringes(stack[whites[0]], white, phase, modulation, background, reason, noise, share)
+        weak = _detect_weak_fringes(stack[whites[0]], white, phase, modulation, background, reason, noise, is_narrow)
         reason[weak] = Reason.INDIRECT
     if layout.gray:
         _mask_unequal_bits(layout, stack, phase, background, reason, noise)
@@ -151,7 +151,7 @@ def _compare_bits(stack, first, frames, inverses, spans, limits, phase, backgrou
 
 def _detect_weak_fringes(
     white_frame: np.ndarray, clipped: float, phase: np.ndarray, modulation: np.ndarray, background: np.ndarray,
-    reason: np.ndarray, noise: tuple[float, float], share: float,
+    reason: np.ndarray, noise: tuple[float, float], is_narrow: bool,
 ) -> np.ndarray:  # fmt: skip
     """Return (h, w) bool: valid pixels whose fringes are weak for their white light, compared with the image's.
 
@@ -159,6 +159,7 @@ def _detect_weak_fringes(
     evenly over a depth range, and the camera's, by the square of the phase's gradient. Both are fitted.
     """
     nothing = np.zeros(phase.shape, bool)
+    share = WEAK_NARROW if is_narrow else WEAK
     valid = (reason == Reason.VALID) & (white_frame < clipped) & (white_frame > background)
     if np.count_nonzero(valid) < FEWEST:
         return nothing
@@ -182,6 +183,8 @@ def _detect_weak_fringes(
     typical = float(np.exp(np.median(sampled.terms @ fit)))
     if not PLAUSIBLE[0] < typical < PLAUSIBLE[1] or spread > MOST_SPREAD:
         return nothing
+    if is_narrow:
+        margin = margin - min(np.log(typical), 0.0)  # narrow fringes: the more unsharp they are, the more blur varies
     expected = np.full(phase.shape, np.inf)
     expected[rows, columns] = _model_terms(phase, slope, rows, columns) @ fit
     with np.errstate(invalid="ignore"):
@@ -189,12 +192,14 @@ def _detect_weak_fringes(
 
 
 def _model_terms(phase: np.ndarray, slope: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """Return (n, 5): what the strength of fringes is linear in, of pixels at ``rows`` and ``columns``.
+    """Return (n, 6): what the strength of fringes is linear in, of pixels at ``rows`` and ``columns``.
 
-    A constant, the place in the image and the phase, which together follow the depth, and the squared gradient.
+    A constant, the place in the image and the phase, which together follow the depth, the phase's square, as blur
+    grows by the square of the distance from focus, and the squared gradient.
     """
     height, width = phase.shape
-    place = [columns / width, rows / height, phase[rows, columns] / 100.0]
+    scaled = phase[rows, columns] / 100.0
+    place = [columns / width, rows / height, scaled, scaled**2]
     return np.stack([np.ones(len(rows)), *place, slope[rows, columns]], axis=1).astype(np.float64)
 
 
@@ -210,7 +215,7 @@ def _square_gradient(phase: np.ndarray, valid: np.ndarray) -> np.ndarray:
 
 
 def _fit_strength(sampled: _Sampled) -> tuple[np.ndarray, float]:
-    """Fit the terms (5,) to the upper side of the strengths; second, the mean distance of those above the fit.
+    """Fit the terms (6,) to the upper side of the strengths; second, the mean distance of those above the fit.
 
     Penalised, so that place and phase, nearly the same on a flat surface, do not cancel to follow indirect light; blur
     never makes the fringes of a steep surface stronger.
@@ -220,7 +225,7 @@ def _fit_strength(sampled: _Sampled) -> tuple[np.ndarray, float]:
     terms = (sampled.terms - middle) / size
     weight = np.ones(len(terms))
     for _ in range(20):
-        penalty = np.diag([0.0, *[PENALTY * weight.sum()] * 4])
+        penalty = np.diag(PENALTIES) * weight.sum()
         normal, moment = (terms.T * weight) @ terms + penalty, (terms.T * weight) @ sampled.strength
         fit = np.linalg.solve(normal, moment)
         if fit[-1] > 0:

@@ -142,6 +142,9 @@ def scan(page: Page, operator: Operator) -> None:
     """The object at three depths."""
     button(page, "6. Scan").click()
     stand(page, "object")
+    choose(page, "Patterns", "micro")
+    chosen = operator.wait_for(lambda s: s.session is not None and s.session.patterns == "micro", PATIENCE_S)
+    assert chosen, "micro was chosen, the session has other patterns"
     for number, depth in enumerate(DEPTHS_MM, 1):
         bring(page, operator, depth)
         name = f"scan_{number:02d}"

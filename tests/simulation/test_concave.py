@@ -24,7 +24,7 @@ def coordinate_errors(sequence_of, angle_deg=90.0, bounces=2):
     """Return errors (n,) px and predicted sigmas (n,) px of the valid pixels of a groove."""
     renderer = Renderer(RIG, groove(POSE, angle_deg, indirect=Indirect(bounces)))
     sequence = one_axis(sequence_of(RIG.projector.size), "x")
-    phase, truth = decode(sequence, renderer.capture(sequence, 1), "x"), renderer.truth()
+    phase, truth = decode(sequence, renderer.capture(sequence, 1), "x", mask_indirect=False), renderer.truth()
     valid = phase.mask & truth.mask
     assert valid.sum() > 0.9 * truth.mask.sum()
     return (phase.coordinate - truth.projector[..., 0])[valid], phase.sigma_px[valid]
