@@ -12,7 +12,7 @@ _CLICKS = {
 }
 _WITHOUT_CLICKS = {
     "Relation": "Choose two points or fits, and measure their distances and angles.",
-    "Deviation": "Choose or upload a nominal model (STL, PLY, OBJ), and compare.",
+    "Deviation": "Choose or upload a nominal model (STL, PLY, OBJ, STEP, 3MF), and compare.",
 }
 
 

@@ -115,9 +115,9 @@ def compare(
     Args:
         session: Session folder.
         scan: Name of the capture, or merge/1 and the like for a merge of the session.
-        nominal: STL, PLY or OBJ file of the part as it should be.
+        nominal: STL, PLY, OBJ, STEP or 3MF file of the part as it should be.
         tolerance: Plus and minus, mm; the answer is pass, fail, or too close to tell.
-        units: What the file's numbers are; required where its size does not fit the scan's.
+        units: What the file's numbers are; required where its size does not fit the scan's. STEP and 3MF state theirs.
         reach: Points farther than this from the nominal, mm, belong to something else (a table, a clamp); by default
             2 % of the nominal's diagonal.
         out: PLY file, the deviation as a scalar and as colours; by default in the session's exports.

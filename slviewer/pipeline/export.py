@@ -27,9 +27,9 @@ What = Literal["cloud", "mesh", "merge", "merged-mesh", "calibration", "coeffici
 pixel, poses of devices, boards and scans, the report, the verifications."""
 FORMATS: dict[What, tuple[str, ...]] = {
     "cloud": POINT_FORMATS,
-    "mesh": MESH_FORMATS[:4],
+    "mesh": MESH_FORMATS[:5],
     "merge": POINT_FORMATS,
-    "merged-mesh": MESH_FORMATS[:4],
+    "merged-mesh": MESH_FORMATS[:5],
     "calibration": ("yml", "xml", "json"),
     "coefficients": ("npz",),
     "poses": ("json", "yml", "xml"),
@@ -110,7 +110,7 @@ def export(
     progress: Progress = ignore_progress,
     warn: Warn = ignore_warnings,
 ) -> Exported:
-    """Write a file for other programs: shapes in mm as .ply .stl .obj .xyz, in metres as .glb; the calibration; poses.
+    """Write a file for other programs: shapes in mm (.ply .stl .obj .3mf .xyz) or m (.glb .e57), calibration, poses.
 
     Args:
         session: Session folder.
@@ -119,7 +119,7 @@ def export(
             HTML; table of the verifications as CSV.
         name: The scan of a cloud or a mesh; the number of a merge, by default the last; the model of coefficients.
         out: The file, whose suffix selects the format, or a folder; by default the session's exports.
-        file_format: ply, stl, obj, glb, xyz, yml, xml, json, ..., where --out is a folder or not given.
+        file_format: ply, stl, obj, glb, 3mf, xyz, e57, yml, xml, json, ..., where --out is a folder or not given.
         model: Which calibration to make a cloud with, by default the one of the stored cloud, or the best; or which to
             write (of splined the pinhole and Brown lenses that come nearest, and their remaining error).
         accept_rejected: Use the calibration although its verdict rejects it.

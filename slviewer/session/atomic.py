@@ -82,14 +82,20 @@ def arriving_file(path: Path, needs_bytes: int = 0) -> Iterator[BinaryIO]:
     For what is too large to be one `bytes`. Raises SessionError if the disk has not `needs_bytes` to spare, or refuses;
     what stood there then stays.
     """
+    with arriving_path(path, needs_bytes) as temporary, open(temporary, "xb") as file:
+        yield file
+
+
+@contextmanager
+def arriving_path(path: Path, needs_bytes: int = 0) -> Iterator[Path]:
+    """As `arriving_file`, of a file that does not exist yet, for a library that creates it itself."""
     temporary = _staging_path(path, "tmp")
     with disk_errors(path.parent, needs_bytes):
         path.parent.mkdir(parents=True, exist_ok=True)
         _require_space(path.parent, needs_bytes)
         try:
-            with open(temporary, "xb") as file:
-                yield file
-                file.flush()
+            yield temporary
+            with open(temporary, "rb+") as file:
                 os.fsync(file.fileno())
             os.replace(temporary, path)
         except BaseException:

@@ -5,6 +5,8 @@
 `.stl`   binary, mm: triangles alone
 `.obj`   text, mm: colours of the vertices, normals
 `.glb`   binary glTF, whose unit is the metre: vertices are written in metres; colours, normals
+`.3mf`   zipped XML, mm as it states: triangles alone, for printers and CAD (`pip install 'slviewer[cad]'`)
+`.e57`   binary, ASTM E2807, in metres: points and their colours (`pip install 'slviewer[e57]'`)
 `.xyz`   text, mm: x y z of a point a line, and its red green blue; no other line, which most readers would not bear
 =======  ===========================================================================================================
 
@@ -13,6 +15,7 @@ whose y points down and whose z points away, by half a turn about x, so that an 
 """
 
 from collections.abc import Mapping, Sequence
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -20,17 +23,20 @@ import numpy as np
 
 from slviewer import __version__
 from slviewer.errors import InputError
-from slviewer.session.atomic import arriving_file, replace_file
+from slviewer.session.atomic import arriving_file, arriving_path, replace_file
+from slviewer.session.cad import require_packages
 from slviewer.session.ply import FACE, check_faces, replace_nan, to_ascii, write_ply
 from slviewer.surface.shapes import Mesh, PointSet
 
-POINT_FORMATS = ("ply", "xyz", "glb")
-MESH_FORMATS = ("ply", "stl", "obj", "glb", "xyz")
+POINT_FORMATS = ("ply", "xyz", "glb", "e57")
+MESH_FORMATS = ("ply", "stl", "obj", "glb", "3mf", "xyz")
 IN_WORDS = {
     "ply": "mm; with colours, normals and sigma",
     "stl": "mm; the triangles alone",
     "obj": "mm; with colours and normals",
     "glb": "metres, as glTF demands, so that programs show the true size; with colours",
+    "3mf": "mm, as the file states; the triangles alone",
+    "e57": "metres, as E57 demands; with colours",
     "xyz": "mm; text, x y z of a point a line, and its colour",
 }
 """Units and content of each format."""
@@ -79,8 +85,10 @@ def write_shape(
         write_ply(path, points, shape.colours, shape.normals, values, faces, notes)
     elif file_format == "xyz":
         _write_xyz(path, points, shape.colours)
+    elif file_format == "e57":
+        _write_e57(path, points, shape.colours, notes)
     else:
-        encode = {"stl": _encode_stl, "obj": _encode_obj, "glb": _encode_glb}[file_format]
+        encode = {"stl": _encode_stl, "obj": _encode_obj, "glb": _encode_glb, "3mf": _encode_3mf}[file_format]
         replace_file(path, encode(shape, notes))
     return path.stat().st_size
 
@@ -95,6 +103,10 @@ def estimated_bytes(
         return 84 + faces * FACET_BYTES
     if file_format == "glb":
         return 1200 + points * (12 + 12 * normals + 4 * colours) + 12 * faces
+    if file_format == "e57":
+        return 4000 + points * (12 + 3 * colours)
+    if file_format == "3mf":
+        return 1500 + 14 * points + 7 * faces
     if file_format == "obj":
         vertex = 3 * _NUMBER + 2 + normals * (3 * _SMALL + 4) + 21 * colours
         return 200 + points * vertex + faces * (3 + 3 * (1 + normals) * len(str(points)) + 6 * normals)
@@ -110,6 +122,23 @@ def _write_xyz(path: Path, points: np.ndarray, colours: np.ndarray | None) -> No
             np.savetxt(file, columns, lengths)
         else:
             np.savetxt(file, np.concatenate([columns, colours], axis=1), [*lengths, "%d", "%d", "%d"])
+
+
+def _write_e57(path: Path, points: np.ndarray, colours: np.ndarray | None, notes: Sequence[str]) -> None:
+    """Write points (n, 3) mm, with colours (n, 3) if given, as an E57 file in metres; needs the package pye57."""
+    if find_spec("pye57") is None:
+        raise InputError(f"{path.name}: .e57 files need the package pye57: install it with pip install 'slviewer[e57]'")
+    import pye57
+
+    fields = dict(zip(("cartesianX", "cartesianY", "cartesianZ"), 1e-3 * points.T.astype(np.float64), strict=True))
+    if colours is not None:
+        fields |= dict(zip(("colorRed", "colorGreen", "colorBlue"), colours.T, strict=True))
+    with arriving_path(path, estimated_bytes("e57", len(points), colours=colours is not None)) as arriving:
+        file = pye57.E57(str(arriving), mode="w")
+        try:
+            file.write_scan_raw(fields, name=to_ascii(notes[0]) if notes else None)
+        finally:
+            file.close()
 
 
 def _to_trimesh(shape: PointSet | Mesh, scale: float = 1.0) -> Any:
@@ -145,6 +174,15 @@ def _encode_obj(shape: PointSet | Mesh, notes: Sequence[str]) -> bytes:
     has_normals = shape.normals is not None
     text: str = export_obj(_to_trimesh(shape), include_normals=has_normals, digits=DECIMALS, header=header)
     return text.encode("ascii")
+
+
+def _encode_3mf(shape: PointSet | Mesh, notes: Sequence[str]) -> bytes:
+    """Return a mesh as the bytes of a 3MF file in mm; SessionError where its packages are missing."""
+    require_packages("3mf")
+    from trimesh.exchange.threemf import export_3MF
+
+    content: bytes = export_3MF(_to_trimesh(shape))
+    return content
 
 
 def _encode_glb(shape: PointSet | Mesh, notes: Sequence[str]) -> bytes:

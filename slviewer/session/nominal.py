@@ -13,11 +13,12 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from slviewer.errors import InputError, SessionError
+from slviewer.session import cad
 from slviewer.session.reading import expand_user, read_file
 from slviewer.surface.shapes import Mesh
 
 Units = Literal["mm", "cm", "m", "inch"]
-FORMATS = (".stl", ".ply", ".obj")
+FORMATS = (".stl", ".ply", ".obj", ".step", ".stp", ".3mf")
 MAX_BYTES = 1 << 28
 MAX_TEXT_BYTES = 1 << 27
 """Of a text STL or OBJ: its numbers need several times its size while they are parsed."""
@@ -59,23 +60,30 @@ class Nominal:
 
 
 def read_nominal(path: Path | str, units: Units | None = None) -> Nominal:
-    """The model in an STL, PLY or OBJ file, whose numbers are in ``units``; where none are given, in mm.
+    """The model in an STL, PLY or OBJ file, whose numbers are in ``units``, or where none are given in mm; or in a STEP
+    or 3MF file, which states its units.
 
     Raises SessionError for a file that cannot be used, with the reason: one that is absent, too large, damaged,
     truncated, of another format, or without triangles.
     """
     path = expand_user(path)
     data = _read_bytes(path)
-    vertices, faces = _load_triangles(path.name, data)
-    if not np.isfinite(vertices).all():
-        raise SessionError(f"{path.name} holds points that are no numbers (NaN or infinite): export the model again")
-    vertices = vertices * MM[units or "mm"]
+    notes: list[str] = []
+    if (form := path.suffix.lower()[1:]) in cad.PACKAGES:
+        vertices, faces = _weld(*cad.load_triangles(path.name, form, data))
+        _check_triangles(path.name, vertices, faces)
+        units = "mm"
+        if form != "3mf":
+            notes.append(f"its surfaces were triangulated within {cad.CHORD_MM:g} mm")
+    else:
+        vertices, faces = _load_triangles(path.name, data)
+        _check_triangles(path.name, vertices, faces)
+        vertices = vertices * MM[units or "mm"]
     if not np.abs(vertices).max() < MAX_COORDINATE_MM:
         raise SessionError(
             f"{path.name} reaches {np.abs(vertices).max():.3g} mm: models up to {MAX_COORDINATE_MM:g} mm are read; "
             "give its units, or move it to its origin"
         )
-    notes: list[str] = []
     vertices, faces = _drop_degenerate(path.name, vertices, faces, notes)
     faces, closed = _orient_faces(vertices, faces, notes)
     digest = hashlib.blake2b(data, digest_size=20).hexdigest()
@@ -114,12 +122,12 @@ def _format_size(size: float) -> str:
 def _read_bytes(path: Path) -> bytes:
     """Return the content of a model's file; SessionError for another format, or one too large to read."""
     if path.suffix.lower() not in FORMATS:
-        raise SessionError(f"{path.name} is no nominal model that can be read: give an STL, PLY or OBJ file")
+        raise SessionError(f"{path.name} is no nominal model that can be read: give an STL, PLY, OBJ, STEP or 3MF file")
     try:
         return read_file(path, MAX_BYTES)
     except OSError as error:
         reason = error.strerror or error
-        raise SessionError(f"{path} cannot be read ({reason}): give an STL, PLY or OBJ file of that size") from error
+        raise SessionError(f"{path} cannot be read ({reason}): give a file of up to {MAX_BYTES >> 20} MiB") from error
 
 
 def _load_triangles(name: str, data: bytes) -> tuple[np.ndarray, np.ndarray]:
@@ -146,13 +154,19 @@ def _load_triangles(name: str, data: bytes) -> tuple[np.ndarray, np.ndarray]:
         raise SessionError(
             f"{name} is truncated: {len(faces):,} of {int(declared[1]):,} triangles were read; export the model again"
         )
+    return vertices, faces
+
+
+def _check_triangles(name: str, vertices: np.ndarray, faces: np.ndarray) -> None:
+    """Raise SessionError where vertices and faces are no triangles, too many, or reach beyond what is read."""
     if vertices.ndim != 2 or vertices.shape[1:] != (3,) or faces.ndim != 2 or faces.shape[1:] != (3,) or not len(faces):
         raise SessionError(f"{name} holds no triangles, or is damaged: export the model as a mesh")
     if len(faces) > MAX_TRIANGLES:
         raise _too_many(name, f"{len(faces):,} triangles")
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise SessionError(f"{name} has triangles whose points are missing: export the model again")
-    return vertices, faces
+    if not np.isfinite(vertices).all():
+        raise SessionError(f"{name} holds points that are no numbers (NaN or infinite): export the model again")
 
 
 def _simplify(name: str, form: str, data: bytes) -> bytes:

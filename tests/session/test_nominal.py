@@ -2,6 +2,7 @@
 
 import os
 import struct
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from slviewer.errors import InputError, SessionError
 from slviewer.session import nominal
 from slviewer.session.nominal import check_size, read_nominal
 
+PLATE = Path(__file__).with_name("plate.step")
 BALL = trimesh.creation.icosphere(2, 40.0)
 
 
@@ -28,6 +30,39 @@ def test_every_format_gives_the_same_closed_mesh(tmp_path: Path) -> None:
         assert found.closed and not found.notes and found.units is None
         assert len(found.mesh.faces) == len(BALL.faces) and len(found.mesh.vertices) == len(BALL.vertices)
         assert found.size_mm == pytest.approx([80, 80, 80], abs=1e-3) and "320 triangles, closed" in found.text()
+
+
+def test_step_and_3mf_state_their_units(tmp_path: Path) -> None:
+    plate = read_nominal(PLATE)  # 60 x 40 x 8 mm with a bore of radius 12, and a pin of radius 5 and height 6
+    assert plate.closed and plate.units == "mm" and plate.notes == ("its surfaces were triangulated within 0.005 mm",)
+    assert plate.size_mm == pytest.approx([60, 40, 14], abs=1e-5)
+    x, y = plate.mesh.vertices[:, :2].T
+    bore = np.hypot(x, y)[(np.hypot(x, y) < 13)]
+    assert bore == pytest.approx(12, abs=1e-4)
+    middles = plate.mesh.vertices[plate.mesh.faces].mean(axis=1)
+    inside = middles[np.hypot(middles[:, 0], middles[:, 1]) < 12.01]
+    assert 0.0005 < 12 - np.hypot(*inside[:, :2].T).min() < 0.006
+    model = tmp_path / "ball.3mf"
+    BALL.export(model)
+    ball = read_nominal(model, "inch")
+    assert ball.units == "mm" and ball.closed and ball.size_mm == pytest.approx([80, 80, 80], abs=1e-3)
+    with zipfile.ZipFile(model) as archive, zipfile.ZipFile(tmp_path / "inch.3mf", "w") as other:
+        for name in archive.namelist():
+            other.writestr(name, archive.read(name).replace(b'unit="millimeter"', b'unit="inch"'))
+    assert read_nominal(tmp_path / "inch.3mf").size_mm == pytest.approx([2032] * 3, abs=0.1)
+
+
+@pytest.mark.parametrize("suffix", ["step", "3mf"])
+def test_damaged_cad_models_are_refused(tmp_path: Path, suffix: str) -> None:
+    BALL.export(tmp_path / "ball.3mf")
+    whole = PLATE.read_bytes() if suffix == "step" else (tmp_path / "ball.3mf").read_bytes()
+    for content in (b"", whole[: len(whole) // 2], whole.replace(b"CARTESIAN_POINT", b"CARTESIAN_PAINT"), b"PK" * 999):
+        if content == whole:
+            continue
+        path = tmp_path / f"damaged.{suffix}"
+        path.write_bytes(content)
+        with pytest.raises(SessionError, match="export the model again"):
+            read_nominal(path)
 
 
 def test_triangles_are_turned_outwards_and_empty_ones_left_out_and_it_is_said(tmp_path: Path) -> None:
@@ -94,7 +129,8 @@ def hostile(folder: Path) -> dict[str, tuple[bytes, str]]:
         "cloud.ply": (ascii_header.replace(b"face 1", b"face 0"), "no triangles"),
         "wrong.obj": (b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", "cannot be read|missing"),
         "points.obj": (b"v 0 0 0\nv 1 0 0\n", "no triangles"),
-        "part.step": (b"ISO-10303-21;", "STL, PLY or OBJ"),
+        "part.step": (b"ISO-10303-21;", "no surfaces"),
+        "part.iges": (b"S      1", "STL, PLY, OBJ, STEP or 3MF"),
     }
 
 

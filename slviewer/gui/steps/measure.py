@@ -85,7 +85,7 @@ class Panel(StepPanel):
         gui, context, operator = self._gui, self._context, self._operator
         with gui.add_folder(None, visible=False) as self._nominal_folder:  # viser cannot hide upload buttons alone
             upload = gui.add_upload_button(
-                "Upload model", icon=viser.Icon.UPLOAD, color="gray", mime_type=".stl,.ply,.obj"
+                "Upload model", icon=viser.Icon.UPLOAD, color="gray", mime_type=".stl,.ply,.obj,.step,.stp,.3mf"
             )
             upload.on_upload(context.callback(lambda: operator.upload_nominal(upload.value.name, upload.value.content)))
             self._nominal = Choice(gui, "Nominal")

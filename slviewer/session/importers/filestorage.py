@@ -4,10 +4,7 @@ Some malformed ones crash OpenCV's parser, and others make it use all memory or 
 """
 
 import json
-import os
-import subprocess
 import sys
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,13 +13,11 @@ import cv2
 import numpy as np
 
 from slviewer.errors import InputError
+from slviewer.session.isolated import limit_process, run_isolated
 from slviewer.session.reading import read_file
 
 _MAX_BYTES = 1 << 24
 _MAX_NUMBERS = 10_000
-_MEMORY_BYTES = 2 << 30
-_SECONDS = 10  # of the processor
-_PATIENCE_S = 60
 
 
 @dataclass(frozen=True)
@@ -51,35 +46,14 @@ def read_storage(path: Path) -> Storage:
         read_file(path, _MAX_BYTES)
     except OSError as error:
         raise InputError(f"{path} cannot be read ({error}): give an OpenCV FileStorage file") from error
-    environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    try:
-        ran = subprocess.run(
-            [sys.executable, "-m", __name__, str(path.absolute())],
-            stdin=subprocess.DEVNULL,
-            capture_output=True,
-            timeout=_PATIENCE_S,
-            env=environment,
-        )
-        status = ran.returncode
-    except subprocess.TimeoutExpired:
-        status = -1
+    status, output = run_isolated(__name__, str(path.absolute()))
     if status != 0:
         reason = "is no" if status == 1 else "makes OpenCV's parser fail, as it is too large or no"
         raise InputError(
             f"{path.name} {reason} OpenCV FileStorage file (.yml, .xml or .json): export the calibration again"
         )
-    entries = json.loads(ran.stdout)
+    entries = json.loads(output)
     return Storage(path.name, {key: None if v is None else np.array(v, np.float64) for key, v in entries.items()})
-
-
-def _limit_process() -> None:
-    """Limit memory and processor time of this process, where the system can."""
-    with suppress(ImportError, ValueError, OSError):
-        import resource
-
-        resource.setrlimit(resource.RLIMIT_AS, (_MEMORY_BYTES, _MEMORY_BYTES))
-        resource.setrlimit(resource.RLIMIT_CPU, (_SECONDS, _SECONDS))
-        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 
 
 def _parse(path: str) -> dict[str, Any]:
@@ -115,5 +89,5 @@ def _numbers(node: Any) -> list[Any]:
 
 
 if __name__ == "__main__":
-    _limit_process()
+    limit_process()
     print(json.dumps(_parse(sys.argv[1])))
