@@ -127,6 +127,9 @@ COMMANDS = Commands(
             read_command, "pipeline.detect:detect_board", "images", options=[JSON], names={"csv_out": "csv"}
         ),
         "report": partial(read_command, "pipeline.report:report", "session"),
+        "verify-report": partial(
+            read_command, "pipeline.certificate:verify_report", "session", "report", options=[JSON]
+        ),
         "inspect": partial(read_command, "pipeline.inspect:inspect", "session"),
         "restore": partial(read_command, "pipeline.restore:restore", "session", "names"),
         "bench": partial(read_command, "validation.bench:bench", options=[JSON]),

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import InputError
 from slviewer.fringe.sequence import Axis
 from slviewer.pipeline.calibration_verdict import load_last_verdict
+from slviewer.pipeline.certificate import certificate_section, certify_page, make_certificate
 from slviewer.pipeline.check import load_drift_history
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
 from slviewer.pipeline.measurements import load_measurements, section_lines
@@ -77,7 +79,10 @@ def report(
             warn(message)
         progress(0.4, "drawing")
         title, subtitle = session_title(data)
-        write_page(out, title, subtitle, session_headlines(data), session_sections(data))
+        progress(0.7, "reading the frames")
+        certificate = make_certificate(store)
+        sections = [*session_sections(data), certificate_section(certificate)]
+        write_page(out, title, subtitle, session_headlines(data), sections, partial(certify_page, certificate))
     progress(1.0, "written")
     return f"report written to {out}"
 

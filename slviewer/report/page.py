@@ -2,11 +2,13 @@
 
 import base64
 import contextlib
+import hashlib
+import html
 import io
 import os
 import re
 import secrets
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from datetime import datetime
@@ -20,6 +22,9 @@ from slviewer import __version__
 from slviewer.errors import InputError
 from slviewer.printable import escape_controls
 
+CERTIFICATE = r'<template id="certificate">(.*?)</template>'
+"""Where a page keeps what it was made from, as escaped JSON; browsers neither show nor run it."""
+_WRITTEN = r"<footer>.*?</footer>"
 Mark = Literal["", "better", "worse", "strong", "muted"]
 """How a value stands to its rivals; colour and weight follow it, and the text beside it says so in words."""
 
@@ -147,12 +152,17 @@ def write_page(
     subtitle: str,
     headlines: Sequence[Headline | tuple[str, str, str]],
     sections: Sequence[Section],
+    certify: Callable[[str], str] | None = None,
 ) -> None:
     """Write the page to ``path``, complete or not at all; every text is shown as typed, never run.
 
-    Raises InputError where the file cannot be written.
+    ``certify``: returns the text of the certificate that the page keeps, given its digest. Raises InputError where the
+    file cannot be written.
     """
     page = _render(title, subtitle, [Headline(*headline) for headline in headlines], sections)
+    if certify is not None:
+        kept = f'<template id="certificate">{html.escape(certify(page_digest(page)))}</template>'
+        page = page.replace("</body>", f"{kept}</body>")
     path = Path(path)
     temporary = path.with_name(f".{path.name}.tmp-{os.getpid()}-{secrets.token_hex(4)}")
     try:
@@ -167,6 +177,12 @@ def write_page(
     finally:
         with contextlib.suppress(OSError):
             temporary.unlink()
+
+
+def page_digest(page: str) -> str:
+    """Return the digest of a page without its certificate, and without the line that says when it was written."""
+    body = re.sub(_WRITTEN, "", re.sub(CERTIFICATE, "", page, flags=re.DOTALL), flags=re.DOTALL)
+    return hashlib.blake2b(body.encode(), digest_size=20).hexdigest()
 
 
 def _render(title: str, subtitle: str, headlines: Sequence[Headline], sections: Sequence[Section]) -> str:

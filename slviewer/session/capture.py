@@ -22,6 +22,7 @@ from slviewer.session.reading import decoding, read_json
 from slviewer.session.stack import (
     check_frames,
     describe_stack,
+    digest_stack,
     hash_frames,
     hash_stack,
     identify_stack,
@@ -108,6 +109,10 @@ class Capture:
                 f"{self.name}: what {self.folder} holds is not what was saved (its hash differs): restore the folder "
                 "from a copy, or import or record the capture again"
             )
+
+    def frame_hashes(self) -> list[str]:
+        """The hash of each stored frame, BLAKE2b of 160 bits; reads all. Raises DamagedError for a damaged one."""
+        return [digest.hex() for digest in digest_stack(self.folder / "frames.zarr")]
 
     @property
     def exposures_ms(self) -> tuple[float, ...]:

@@ -73,6 +73,12 @@ def read_stack(path: Path, indices: Sequence[int] | None = None) -> np.ndarray:
 def hash_stack(path: Path) -> str:
     """Read a whole stack and return its content hash, as `write_stack` does. Raises DamagedError as `read_stack`."""
     stack = _StoredStack.open(path)
+    return _combine_digests(stack.shape, stack.dtype, digest_stack(path))
+
+
+def digest_stack(path: Path) -> list[bytes]:
+    """Read a whole stack and return the digest of each frame. Raises DamagedError as `read_stack`."""
+    stack = _StoredStack.open(path)
 
     def digest(index: int) -> bytes:
         """Read one frame and return its digest."""
@@ -82,7 +88,7 @@ def hash_stack(path: Path) -> str:
         return _digest(frame)
 
     with ThreadPoolExecutor(_THREADS) as pool:
-        return _combine_digests(stack.shape, stack.dtype, list(pool.map(digest, range(stack.shape[0]))))
+        return list(pool.map(digest, range(stack.shape[0])))
 
 
 def hash_frames(frames: np.ndarray) -> str:

@@ -1,0 +1,455 @@
+"""What a report was made from, kept in it, and whether its figures follow from the session's frames.
+
+A certificate names the hash of every frame, capture and result and the versions of the software, and holds the figures.
+"""
+
+import html
+import platform
+import re
+import shutil
+import tempfile
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from functools import cache
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Literal
+
+import msgspec
+import numpy as np
+
+from slviewer import __version__
+from slviewer.calibration.pixelwise import PixelwiseModel
+from slviewer.calibration.splined.model import SplinedModel
+from slviewer.errors import InputError, SlviewerError
+from slviewer.evaluation.render import format_count
+from slviewer.inspection.regions import Region
+from slviewer.pipeline.calibrate import calibrate
+from slviewer.pipeline.compare import compare_surface
+from slviewer.pipeline.feedback import Progress, ignore_progress, ignore_warnings
+from slviewer.pipeline.measured_surface import MERGED, Place, load_surface
+from slviewer.pipeline.measurements import (
+    add_distance,
+    add_fit,
+    add_point,
+    add_relation,
+    add_section,
+    load_measurements,
+    quantities_of,
+)
+from slviewer.pipeline.models import MODELS, available_models, load_model, load_stereo_if_complete
+from slviewer.pipeline.open_session import SessionLike, numbered_results, opened
+from slviewer.pipeline.scale import load_scale_correction
+from slviewer.pipeline.verify import verify
+from slviewer.records import from_plain
+from slviewer.report.page import CERTIFICATE, Column, Section, Table, page_digest
+from slviewer.session.measurements import Measurement
+from slviewer.session.nominal import read_nominal
+from slviewer.session.reading import expand_user, read_file
+from slviewer.session.store import Session
+
+SCHEMA = 1
+PACKAGES = ("numpy", "scipy", "opencv-python-headless", "numba", "trimesh")
+"""Whose versions a certificate names, besides Python's and our own."""
+RELATIVE = 1e-3
+"""Difference of a figure, as a share of it, up to which it is the same: other processors round otherwise."""
+ABSOLUTE = 2e-6
+"""... and in the figure's own unit, mm or px."""
+NOMINALS = "nominal"
+"""Folder of a session with the nominal models that were uploaded."""
+_MAX_REPORT_BYTES = 1 << 29
+FRAMES = "frames of "
+_BY_OPERATOR = ("excluded by the operator", "not among the poses", "excluded for this calibration")
+
+Figures = dict[str, dict[str, float]]
+"""{result: {figure: value}}, with the unit in the figure's name."""
+State = Literal["same", "differs", "not recomputed", "missing"]
+IN_WORDS: Mapping[State, str] = {
+    "same": "follows from the frames",
+    "differs": "DIFFERS",
+    "not recomputed": "not recomputed",
+    "missing": "MISSING",
+}
+
+
+class Certificate(msgspec.Struct, frozen=True):
+    """What a report was made from. ``captures``: {name: {role, hash, frames: hash of each}}; ``results``: {name: hash};
+    ``page``: digest of the page without this certificate and its date."""
+
+    schema: int
+    session: str
+    software: dict[str, str]
+    captures: dict[str, dict[str, Any]]
+    results: dict[str, str]
+    figures: Figures
+    page: str = ""
+
+
+@dataclass(frozen=True)
+class Check:
+    """One thing that was checked, what was found, and a sentence on it."""
+
+    what: str
+    state: State
+    detail: str = ""
+
+
+@dataclass(frozen=True)
+class ReportCheck:
+    """Whether a report's figures follow from a session's frames."""
+
+    checks: tuple[Check, ...]
+
+    @property
+    def failure(self) -> str:
+        """Which checks failed, as a sentence; empty where none did."""
+        failed = [check.what for check in self.checks if check.state in ("differs", "missing")]
+        return f"the report does not follow from the session: {', '.join(failed)}" if failed else ""
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the published values of ``verify-report --json``."""
+        return {"holds": not self.failure, "checks": [asdict(check) for check in self.checks]}
+
+    def text(self) -> str:
+        """Return the result as a report for the terminal."""
+        frames = [check for check in self.checks if check.what.startswith(FRAMES) and check.state == "same"]
+        shown = [check for check in self.checks if check not in frames]
+        lines = [f"{check.what}: {IN_WORDS[check.state]}{check.detail and f' ({check.detail})'}" for check in shown]
+        if frames:
+            lines.insert(1, f"frames of {format_count(len(frames), 'capture')}: as they were")
+        left = sum(check.state == "not recomputed" for check in self.checks)
+        end = f"; {format_count(left, 'item')} could not be checked" if left else ""
+        return "\n".join([*lines, f"{'DOES NOT HOLD' if self.failure else 'HOLDS'}{end}"])
+
+
+def make_certificate(store: Session) -> Certificate:
+    """Return the certificate of a session as it is, without the digest of a page; reads every frame."""
+    captures = {
+        capture.name: {"role": capture.role, "hash": capture.hash, "frames": capture.frame_hashes()}
+        for capture in store.captures()
+    }
+    results = {name: store.input_hashes(name)[name] for name in store.result_names()}
+    return Certificate(SCHEMA, store.folder.name, _software(), captures, results, collect_figures(store))
+
+
+def collect_figures(store: Session) -> Figures:
+    """Return the figures of the calibrations, verifications and measurements that are fresh."""
+    figures: Figures = {}
+    for name in available_models(store):
+        if store.state_of(f"calibration/{name}") == "fresh":
+            figures[f"calibration/{name}"] = _calibration_figures(store, name)
+    for name in numbered_results(store, "verify"):
+        if store.state_of(name) == "fresh":
+            models = store.load_result(name, only=())[0]["models"]
+            figures[name] = {
+                f"{model} {key}": float(values[key])
+                for model, values in models.items()
+                for key in ("rms_mm", "noise_floor_mm", "radius_mm")
+                if values[key] is not None
+            }
+    for measured in load_measurements(store):
+        if not measured.stale:
+            figures[f"measurements/{measured.id}"] = _measurement_figures(measured)
+    return figures
+
+
+def verify_report(session: SessionLike, report: Path | str, *, progress: Progress = ignore_progress) -> ReportCheck:
+    """Recompute a report's figures from the raw frames of a session, and compare.
+
+    Args:
+        session: Session folder with the captures that the report was made from.
+        report: The .html file that `report` wrote.
+
+    The page, every frame, calibration, verification and measurement is checked; what cannot be recomputed (merges, and
+    models whose file is gone) is listed. The session is not changed.
+    """
+    page, certificate = read_certificate(expand_user(report))
+    with opened(session) as store:
+        checks = [_check_page(page, certificate), *_check_versions(certificate)]
+        progress(0.02, "reading the frames")
+        checks += _check_frames(store, certificate)
+        if any(check.state != "same" for check in checks if check.what.startswith(FRAMES)):
+            return ReportCheck(tuple(checks))
+        with tempfile.TemporaryDirectory(prefix="slviewer-") as folder:
+            made, why = _recompute(store, certificate, Path(folder, "session"), progress)
+        checks += [_compare(name, given, made.get(name), why) for name, given in certificate.figures.items()]
+    progress(1.0, "compared")
+    return ReportCheck(tuple(checks))
+
+
+def read_certificate(path: Path) -> tuple[str, Certificate]:
+    """Return a report's page and its certificate; InputError where it has none that can be read."""
+    try:
+        page = read_file(path, _MAX_REPORT_BYTES).decode()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path} cannot be read ({error}): give a report that slviewer wrote") from error
+    found = re.search(CERTIFICATE, page, re.DOTALL)
+    if found is None:
+        raise InputError(f"{path.name} holds no certificate: write the report again with this version of slviewer")
+    try:
+        certificate = msgspec.json.decode(html.unescape(found[1]), type=Certificate)
+    except (msgspec.DecodeError, RecursionError) as error:
+        raise InputError(f"the certificate in {path.name} is damaged ({error}): write the report again") from error
+    if certificate.schema > SCHEMA:
+        raise InputError(f"{path.name} was written by a newer slviewer: update slviewer")
+    return page, certificate
+
+
+def _software() -> dict[str, str]:
+    """Return the versions of Python, slviewer and what it computes with."""
+    return {"slviewer": __version__, "python": platform.python_version()} | {name: version(name) for name in PACKAGES}
+
+
+def _calibration_figures(store: Session, name: str) -> dict[str, float]:
+    """Return the figures of one of the session's calibrations."""
+    model = load_model(store, name)
+    if isinstance(model, PixelwiseModel):
+        return {f"median RMS in z along {axis}, mm": float(np.nanmedian(f.rms_mm[0])) for axis, f in model.fits.items()}
+    if name == "splined":
+        assert isinstance(model, SplinedModel)
+        summary = model.summary()
+        noise = {f"noise {place}, px": value for place, value in summary["noise_px"].items()}
+        return noise | {f"residuals over noise {axis}": v for axis, v in summary["residuals_over_noise"].items()}
+    stereo = load_stereo_if_complete(store)
+    assert stereo is not None
+    figures = {f"reprojection RMS {device}, px": rms for device, rms in stereo.reprojection_rms_px.items()}
+    return figures | {"baseline, mm": stereo.baseline_mm}
+
+
+def _measurement_figures(measured: Measurement) -> dict[str, float]:
+    """Return a measurement's values and uncertainties."""
+    values = {f"{q.name}, {q.unit}": q.value for q in quantities_of(measured)}
+    return values | {f"U of {q.name}, {q.unit}": q.U for q in quantities_of(measured) if q.U is not None}
+
+
+def _check_page(page: str, certificate: Certificate) -> Check:
+    """Return whether the page is the one that was written with its certificate."""
+    if page_digest(page) == certificate.page:
+        return Check("page", "same", "as it was written")
+    return Check("page", "differs", "its text, pictures or numbers were changed after it was written")
+
+
+def _check_versions(certificate: Certificate) -> list[Check]:
+    """Return a line about the software, where it is another than the report's."""
+    changed = [
+        f"{name} {certificate.software.get(name, '?')} then, {now} now"
+        for name, now in _software().items()
+        if certificate.software.get(name) != now
+    ]
+    return [Check("software", "not recomputed", "; ".join(changed))] if changed else []
+
+
+def _check_frames(store: Session, certificate: Certificate) -> list[Check]:
+    """Read every capture that the report names, and compare the hash of each frame."""
+    captures = {capture.name: capture for capture in store.captures()}
+    checks = []
+    for name, given in certificate.captures.items():
+        what = f"{FRAMES}{name}"
+        if name not in captures:
+            checks.append(Check(what, "missing", "the session has no such capture, or it is damaged"))
+            continue
+        try:
+            captures[name].verify()
+            now = captures[name].frame_hashes()
+        except SlviewerError as error:
+            checks.append(Check(what, "differs", str(error)))
+            continue
+        changed = [i for i, (a, b) in enumerate(zip(given["frames"], now, strict=False)) if a != b]
+        if changed or len(now) != len(given["frames"]) or captures[name].hash != given["hash"]:
+            where = f"frame {changed[0] + 1}" if changed else "the description of the capture"
+            checks.append(Check(what, "differs", f"{where} is another than the report's"))
+        else:
+            checks.append(Check(what, "same", f"{len(now)} frames"))
+    return checks
+
+
+def _recompute(
+    store: Session, certificate: Certificate, folder: Path, progress: Progress
+) -> tuple[Figures, dict[str, str]]:
+    """Compute what the report shows from the frames alone, in a session of its own; second, {result: why not}."""
+    why: dict[str, str] = {}
+    with Session.create(folder) as fresh:
+        for name in certificate.captures:
+            _link(store.load_capture(name).folder, fresh.folder / "captures" / name)
+        if "calibration/stereo" in certificate.figures:
+            progress(0.1, "calibrating")
+            _calibrate_again(store, fresh, why)
+        names = [name for name in certificate.figures if name.startswith("verify/")]
+        figures = collect_figures(fresh)
+        for k, name in enumerate(names):
+            progress(0.6 + 0.2 * k / len(names), f"measuring {name.removeprefix('verify/')}")
+            with _noting(why, name):
+                figures[name] = _verify_again(store, fresh, name)
+        figures |= _measure_again(store, fresh, certificate, why, progress)
+    return figures, why
+
+
+def _link(folder: Path, place: Path) -> None:
+    """Let a folder appear in another place; a copy where the system makes no links."""
+    try:
+        place.symlink_to(folder, target_is_directory=True)
+    except OSError:
+        shutil.copytree(folder, place)
+
+
+def _calibrate_again(store: Session, fresh: Session, why: dict[str, str]) -> None:
+    """Calibrate a session from the frames with the settings of another's calibration, and take over its scale."""
+    models = available_models(store)
+    stereo, meta = load_stereo_if_complete(store), store.load_result("calibration/stereo", only=())[0]
+    if stereo is None or "settings" not in meta:
+        why |= {
+            f"calibration/{name}": "it was imported: its figures are not from the session's frames" for name in models
+        }
+        for name in models:
+            fresh.save_result(f"calibration/{name}", *store.load_result(f"calibration/{name}"))
+        return
+    left_out = [name for name, reason in stereo.excluded.items() if reason.startswith(_BY_OPERATOR)]
+    poses = [name for name in (*stereo.poses, *stereo.excluded) if name not in left_out and name in fresh.taken_names()]
+    settings = meta["settings"]
+    with _noting(why, *(f"calibration/{name}" for name in models)):
+        calibrate(
+            fresh,
+            settings["target"],
+            models=[name for name in MODELS if name in models],
+            poses=poses,
+            smoothing=settings["smoothing"],
+            degree=settings["degree"],
+        )
+    for model in available_models(fresh):
+        if (applied := load_scale_correction(store, model)) is not None:
+            inputs = fresh.input_hashes(f"calibration/{model}")
+            fresh.save_result(f"scale/{model}", {**applied, "inputs": inputs}, {})
+
+
+def _verify_again(store: Session, fresh: Session, result: str) -> dict[str, float]:
+    """Measure a plane or sphere again, with the models that were compared before; return its figures."""
+    name, meta = result.removeprefix("verify/"), store.load_result(result, only=())[0]
+    found = verify(fresh, [name], meta["shape"], models=list(meta["models"]), check=False).captures[name].to_json()
+    return {
+        f"{model} {key}": float(values[key])
+        for model, values in found["models"].items()
+        for key in ("rms_mm", "noise_floor_mm", "radius_mm")
+        if values[key] is not None
+    }
+
+
+def _measure_again(
+    store: Session, fresh: Session, certificate: Certificate, why: dict[str, str], progress: Progress
+) -> Figures:
+    """Make the session's measurements again on scans that are reconstructed anew; return their figures."""
+    surface = cache(lambda source, model: load_surface(fresh, source, model=model))
+    again: dict[str, str] = {}
+    figures: Figures = {}
+    wanted = [m for m in load_measurements(store) if f"measurements/{m.id}" in certificate.figures]
+    for k, measured in enumerate(wanted):
+        progress(0.8 + 0.2 * k / len(wanted), f"measuring {measured.name}")
+        result = f"measurements/{measured.id}"
+        if measured.source.startswith(MERGED) or MERGED in measured.source:
+            why[result] = "merges are not registered again"
+            continue
+        with _noting(why, result):
+            made = _repeat(store, fresh, measured, surface, again)
+            again[measured.id] = made.id
+            figures[result] = _measurement_figures(made)
+    return figures
+
+
+def _repeat(
+    store: Session,
+    fresh: Session,
+    measured: Measurement,
+    surface: Callable[[str, str], Any],
+    again: Mapping[str, str],
+) -> Measurement:
+    """Make one measurement of a session again in another. Raises SlviewerError where that is not possible."""
+    if measured.kind == "relation":
+        if missing := [each for each in measured.of if each not in again]:
+            raise InputError(f"{', '.join(missing)} could not be measured again")
+        return add_relation(fresh, *(again[each] for each in measured.of))
+    on, data = surface(measured.source, measured.model), measured.data
+    if measured.kind == "point":
+        return add_point(fresh, on, from_plain(data["at"], Place))  # type: ignore[arg-type]
+    if measured.kind in ("distance", "section"):
+        a, b = from_plain(data["at"], tuple[Place, Place])
+        return (add_distance if measured.kind == "distance" else add_section)(fresh, on, a, b)
+    if measured.kind == "deviation":
+        path = _find_nominal(store, data["nominal"]["hash"])
+        verdict = data.get("verdict")
+        made = compare_surface(
+            fresh,
+            on,
+            read_nominal(path, data["nominal"]["units"]),
+            tolerance=None if verdict is None else verdict["tolerance_mm"],
+            reach=data["reach_mm"],
+            warn=ignore_warnings,
+        )
+        assert made.measurement is not None
+        return made.measurement
+    return add_fit(fresh, on, measured.kind, from_plain(data["region"], Region))  # type: ignore[arg-type]
+
+
+def _find_nominal(store: Session, content: str) -> Path:
+    """Return the session's nominal model of that content; InputError where there is none."""
+    for path in sorted((store.folder / NOMINALS).glob("[!.]*")):
+        try:
+            if read_nominal(path).hash == content:
+                return path
+        except SlviewerError:
+            continue
+    raise InputError("its nominal model is not in the session")
+
+
+class _noting:  # noqa: N801 (a context manager, used as a function)
+    """Note the reason of a failure for these results, and go on."""
+
+    def __init__(self, why: dict[str, str], *results: str) -> None:
+        self._why, self._results = why, results
+
+    def __enter__(self) -> None: ...
+
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> bool:
+        if not isinstance(error, SlviewerError):
+            return False
+        self._why |= dict.fromkeys(self._results, str(error))
+        return True
+
+
+def _compare(name: str, given: Mapping[str, float], made: Mapping[str, float] | None, why: Mapping[str, str]) -> Check:
+    """Return whether a result's figures are those that were computed again."""
+    if made is None:
+        return Check(name, "not recomputed", why.get(name, "the session no longer holds what it was made with"))
+    for key, value in given.items():
+        now = made.get(key, np.nan)
+        if not np.isclose(now, value, rtol=RELATIVE, atol=ABSOLUTE, equal_nan=True):
+            return Check(name, "differs", f"{key}: {value:.6g} in the report, {now:.6g} now")
+    return Check(name, "same", f"{len(given)} figures")
+
+
+def certify_page(certificate: Certificate, page: str) -> str:
+    """Return the certificate of the page with that digest, as JSON."""
+    return msgspec.json.encode(msgspec.structs.replace(certificate, page=page)).decode()
+
+
+def certificate_section(certificate: Certificate) -> Section:
+    """Return what a certificate names, as a section of the report."""
+    captures = Table(
+        [Column("capture", align="left"), Column("role", align="left"), Column("frames"), Column("hash", align="left")],
+        [[name, c["role"], str(len(c["frames"])), c["hash"]] for name, c in certificate.captures.items()],
+        "Captures",
+        ["BLAKE2b, 160 bits, of frames and description; the hash of every single frame is kept in this file."],
+    )
+    results = Table(
+        [Column("result", align="left"), Column("hash", align="left")],
+        [[name, certificate.results[name]] for name in certificate.figures],
+        "Calibrations, verifications and measurements",
+    )
+    software = Table(
+        [Column("software", align="left"), Column("version", align="left")],
+        [[name, number] for name, number in certificate.software.items()],
+        "Software",
+    )
+    text = (
+        "What the figures were computed from. `slviewer verify-report` reads this file and the session, computes the "
+        "figures again from the frames, and says whether they agree."
+    )
+    return Section("Certificate", text, [item for item in (captures, results, software) if item.rows])

@@ -1,0 +1,114 @@
+"""A report names what it was made from, and its figures are computed again from the frames."""
+
+import html
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from slviewer.cli import main
+from slviewer.errors import InputError
+from slviewer.inspection.regions import Region
+from slviewer.pipeline.certificate import ReportCheck, certify_page, read_certificate, verify_report
+from slviewer.pipeline.measured_surface import load_surface
+from slviewer.pipeline.measurements import add_distance, add_fit, add_relation, add_section
+from slviewer.pipeline.report import report
+from slviewer.report.page import CERTIFICATE
+from slviewer.session.store import Session
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def certified(recorded: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """A session, calibrated without splined, with measurements; and the report of it."""
+    base = tmp_path_factory.mktemp("certified")
+    folder, page = base / "session", base / "report.html"
+    shutil.copytree(recorded / "session", folder)
+    with Session.open(folder, write=True) as store:
+        store.trash_result("calibration/splined")
+    assert main(["calibrate", str(folder), "--target", "circles:21x16:9", "--models", "stereo", "pixelwise"]) == 0
+    with Session.open(folder, write=True) as store:
+        plane = load_surface(store, "plane_01")
+        middle = tuple(int(v) for v in np.argwhere(plane.measured).mean(axis=0)[::-1])
+        first = add_fit(store, plane, "plane", Region.ball(plane.points[middle[1], middle[0]], 20.0))
+        add_distance(store, plane, (middle[0] - 20, middle[1]), (middle[0] + 20, middle[1]))
+        add_section(store, plane, (middle[0] - 20, middle[1]), (middle[0] + 20, middle[1]))
+        second = add_fit(store, plane, "plane", Region.ball(plane.points[middle[1], middle[0] + 30], 15.0))
+        add_relation(store, first.id, second.id)
+        report(store, page)
+    return folder, page
+
+
+def states(found: ReportCheck) -> dict[str, str]:
+    return {check.what: check.state for check in found.checks}
+
+
+def test_the_figures_of_a_report_follow_from_the_frames(certified: tuple[Path, Path]) -> None:
+    folder, page = certified
+    before = sorted(path.name for path in folder.rglob("*"))
+    found = verify_report(folder, page)
+    assert not found.failure, found.text()
+    assert set(states(found).values()) == {"same"}, found.text()
+    results = {"calibration/stereo", "calibration/pixelwise", "measurements/m1", "measurements/m5"}
+    assert {"page", "frames of pose_01"} | results <= set(states(found))
+    assert sorted(path.name for path in folder.rglob("*")) == before
+    certificate = read_certificate(page)[1]
+    assert all(len(c["frames"]) in (26, 52) and len(set(c["frames"])) > 20 for c in certificate.captures.values())
+    assert "verify-report" in page.read_text() and "<script" not in page.read_text()
+
+
+def test_a_number_changed_in_the_page_is_found(certified: tuple[Path, Path], tmp_path: Path) -> None:
+    folder, page = certified
+    text = page.read_text()
+    distance = read_certificate(page)[1].figures["measurements/m2"]["distance, mm"]
+    shown = f"{distance:.4f}"[:-1]
+    assert shown in text
+    changed = tmp_path / "changed.html"
+    changed.write_text(text.replace(shown, "99.999", 1))
+    found = verify_report(folder, changed)
+    assert states(found)["page"] == "differs" and "page" in found.failure
+
+
+def test_a_figure_forged_with_its_digest_does_not_follow_from_the_frames(
+    certified: tuple[Path, Path], tmp_path: Path
+) -> None:
+    folder, page = certified
+    text, certificate = read_certificate(page)
+    figures = {name: dict(values) for name, values in certificate.figures.items()}
+    figures["measurements/m2"]["distance, mm"] *= 1.01
+    forged = certify_page(msgspec.structs.replace(certificate, figures=figures), certificate.page)
+    kept = f'<template id="certificate">{html.escape(forged)}</template>'
+    (tmp_path / "forged.html").write_text(re.sub(CERTIFICATE, lambda _: kept, text, flags=re.DOTALL))
+    found = verify_report(folder, tmp_path / "forged.html")
+    assert [check.what for check in found.checks if check.state == "differs"] == ["measurements/m2"]
+    assert "distance, mm" in found.text() and "DOES NOT HOLD" in found.text()
+
+
+def test_other_frames_are_found(certified: tuple[Path, Path], tmp_path: Path, run: Callable[..., tuple]) -> None:
+    folder = shutil.copytree(certified[0], tmp_path / "session")
+    with Session.open(folder, write=True) as store:
+        capture = store.load_capture("plane_01")
+        frames = capture.frames.copy()
+        frames[7, 100, 100] ^= 1
+        store.save_capture("plane_01", capture.role, capture.sequence, frames, source="changed", force=True)
+        store.trash_capture("sphere_3")
+    status, out, error = run("verify-report", folder, certified[1])
+    assert status == 1 and "frames of plane_01" in error and "frames of sphere_3" in error
+    assert "frame 8 is another than the report's" in out and "no such capture" in out
+
+
+def test_pages_without_a_certificate_are_refused(certified: tuple[Path, Path], tmp_path: Path) -> None:
+    page = tmp_path / "page.html"
+    for content, reason in (
+        ("<html></html>", "no certificate"),
+        ('<template id="certificate">{"schema": 1</template>', "damaged"),
+        ('<template id="certificate">{"schema": "x"}</template>', "damaged"),
+    ):
+        page.write_text(content)
+        with pytest.raises(InputError, match=reason):
+            verify_report(certified[0], page)
