@@ -28,7 +28,7 @@ from slviewer.pipeline.open_session import SessionLike, opened
 from slviewer.pipeline.scale import describe_scale
 from slviewer.reconstruction.cloud import Cloud, choose_pixels
 from slviewer.reconstruction.mesh import triangulate_grid
-from slviewer.reconstruction.reconstruct import JUMP
+from slviewer.reconstruction.reconstruct import JUMP, normals
 from slviewer.session.capture import Capture
 from slviewer.session.ply import write_ply
 from slviewer.session.store import Session
@@ -156,7 +156,13 @@ def reconstruct(
         faces = triangulate_points(cloud.points, mask) if mesh else None
         notes = (f"scan {capture}, frame: {frame_of(store, name)}", f"calibration {name}")
         write_ply(
-            ply, choose_pixels(cloud.points, mask), texture[mask], scalars=cloud.sigmas(mask), faces=faces, notes=notes
+            ply,
+            choose_pixels(cloud.points, mask),
+            texture[mask],
+            normals(cloud.points)[mask],
+            cloud.sigmas(mask),
+            faces,
+            notes,
         )
         if grid is not None:
             write_grid(Path(grid), cloud.points)

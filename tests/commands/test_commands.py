@@ -10,6 +10,7 @@ import pytest
 import trimesh
 
 from slviewer.session.exporters import write_calibration
+from slviewer.session.ply import read_ply
 from slviewer.session.store import Session
 
 pytestmark = pytest.mark.slow
@@ -64,6 +65,8 @@ def test_reconstruct_a_board_pose_and_a_scan(calibrated: dict, session: Path, ru
     assert points.shape == (300, 400, 3) and points.dtype == np.float32
     cloud = trimesh.load(ply)
     assert 1000 < len(cloud.vertices) <= np.isfinite(points[..., 2]).sum()
+    normals = read_ply(ply).normals
+    assert normals is not None and np.nanmedian(normals[:, 2]) < -0.7  # the board faces the camera
     status, text, _ = run("reconstruct", session, "object_r2", "--model", "stereo", "--axis", "x")
     assert status == 0 and (session / "exports" / "object_r2_stereo.ply").exists()
     status, _, error = run("reconstruct", session, "object_r2", "--axis", "y")
