@@ -246,7 +246,8 @@ def merge(
         ]:
             warn(why)
         clouds = clouds if keep_background else dict(registered.clouds)
-        fused = fuse(clouds, alignment.T_reference_scan, stage(progress, 0.75, 0.9, "fusing"))
+        left = {name: (each.covariance, each.centre) for name, each in alignment.uncertainties.items()}
+        fused = fuse(clouds, alignment.T_reference_scan, stage(progress, 0.75, 0.9, "fusing"), left)
         progress(0.9, "writing")
         surface = fused.surface
         scalars = {} if surface.sigma_mm is None else {"sigma": surface.sigma_mm}

@@ -7,7 +7,7 @@ where it is curved, so that nothing is smoothed beyond one scan's resolution.
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
 import cv2
 import numpy as np
@@ -50,10 +50,21 @@ class Fused:
         return float((self.seen_by > 1).mean())
 
 
+PoseCovariance = tuple[np.ndarray, np.ndarray]
+"""Covariance (6, 6) of a scan's pose in the reference's frame: of a small rotation (rad) about a centre (3,) mm, and of
+a translation (mm); and that centre."""
+
+
 def fuse(
-    scans: Mapping[str, Cloud], T_reference_scan: Mapping[str, np.ndarray], progress: Progress | None = None
+    scans: Mapping[str, Cloud],
+    T_reference_scan: Mapping[str, np.ndarray],
+    progress: Progress | None = None,
+    poses: Mapping[str, PoseCovariance] | None = None,
 ) -> Fused:
     """Fuse organised clouds, each in its camera's frame, with the pose (4, 4) of each by the same name.
+
+    ``poses``: how uncertain these poses are; it becomes part of the points' sigmas, as if a point were from its best
+    scan alone.
 
     ``progress`` receives the completed share of the work, 0 to 1, and may raise to cancel. A single scan is only
     cleaned.
@@ -79,7 +90,10 @@ def fuse(
     parts = []
     for i, name in enumerate(names):
         report(0.5 + 0.5 * i / len(names))
-        parts.append(_fuse_scan(name, views, pairs, gains))
+        points, seen_by = _fuse_scan(name, views, pairs, gains)
+        if poses is not None and name in poses:
+            points = _add_pose_error(points, *poses[name])
+        parts.append((points, seen_by))
     report(1.0)
     return Fused(
         surface=_concatenate([part[0] for part in parts]),
@@ -199,6 +213,14 @@ def _average(view: View, points: np.ndarray, normals: np.ndarray, sums: np.ndarr
     if coloured:
         colours = np.clip(sums[:, 9:] / np.maximum(sums[:, 8:9], 1e-12) + 0.5, 0, 255).astype(np.uint8)
     return PointSet(moved, mean_normals, colours, sigma)
+
+
+def _add_pose_error(points: PointSet, covariance: np.ndarray, centre: np.ndarray) -> PointSet:
+    """Return the points with the error that their scan's pose has along the normals added to their sigmas."""
+    assert points.normals is not None and points.sigma_mm is not None
+    lever = np.hstack([np.cross(points.points - centre, points.normals), points.normals])
+    pose = np.einsum("ij,jk,ik->i", lever, covariance, lever)
+    return replace(points, sigma_mm=np.sqrt(points.sigma_mm**2 + np.maximum(pose, 0.0)))
 
 
 def _concatenate(parts: list[PointSet]) -> PointSet:

@@ -49,6 +49,20 @@ def test_a_place_is_kept_once_with_its_normal_outwards(fused: Fused) -> None:
     assert fused.shared > 0.9 and all(0.02 < pair.rms_mm < 0.1 for pair in fused.pairs.values())
 
 
+def test_the_error_of_a_pose_is_part_of_sigma_where_it_moves_the_surface(fused: Fused) -> None:
+    covariance = np.diag([0, 0, 0, 0, 0, 0.1**2])  # 0.1 mm along z
+    uncertain = fuse(*depths(), poses={"near": (covariance, np.zeros(3))})
+    before, after = fused.surface.sigma_mm, uncertain.surface.sigma_mm
+    assert before is not None and after is not None and uncertain.surface.normals is not None
+    near = uncertain.source == uncertain.names.index("near")
+    added = np.sqrt(after.astype(np.float64) ** 2 - before.astype(np.float64) ** 2)
+    np.testing.assert_allclose(added[near], 0.1 * np.abs(uncertain.surface.normals[near, 2]), atol=1e-3)
+    assert near.mean() > 0.5 and np.array_equal(after[~near], before[~near])
+    turned = fuse(*depths(), poses={"near": (np.diag([1e-6, 0, 0, 0, 0, 0]), np.zeros(3))})  # about the ball's middle
+    assert turned.surface.sigma_mm is not None
+    assert np.abs(turned.surface.sigma_mm - before).max() < 0.05 * np.median(before)
+
+
 def test_a_bad_scan_weighs_little() -> None:
     scans, poses = depths()
     shifted = poses["far"].copy()
