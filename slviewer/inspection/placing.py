@@ -20,6 +20,9 @@ GOOD_RMS = 0.002
 """Of the nominal's diagonal: no better place is looked for than one that leaves less, or thrice the noise, of most of
 the scan."""
 GOOD_OVERLAP = 0.6
+LEAST_SCORE = 0.1
+"""Share of the scan that must lie on the nominal after the coarse search: from there on a pose is refined. The part
+itself reaches 0.5 and more, other parts below 0.15."""
 VIEWS = [
     np.array(view) / np.linalg.norm(view)
     for view in sorted(product((-1, 0, 1), repeat=3), key=lambda v: (np.count_nonzero(v), -abs(v[2])))[1:]
@@ -81,6 +84,9 @@ def _register_symmetric(scan: PreparedScan, reference: PreparedScan) -> Registra
     them does not change the deviations."""
     size = min(scan.size, reference.size)
     starts = search_starts(scan, reference, size)
+    if not starts or starts[0].score < LEAST_SCORE:
+        best = 100 * starts[0].score if starts else 0.0
+        raise Refused("overlap", f"At most {best:.0f} % of the scan lies on a side of the model, in any of its poses.")
     try:
         return register_prepared(scan, reference, size=size, starts=starts)
     except Refused as error:

@@ -181,12 +181,13 @@ def test_a_scan_without_points_is_refused(ammonite) -> None:
             deviation(points, ammonite[1], initial=np.eye(4))
 
 
-def test_another_part_is_refused(ammonite, monkeypatch) -> None:
+def test_another_part_is_refused_without_refining_any_pose(ammonite, monkeypatch) -> None:
     monkeypatch.setattr(placing, "VIEWS", placing.VIEWS[:2])
+    monkeypatch.setattr(placing, "register_prepared", lambda *given, **options: pytest.fail("a pose was refined"))
     _, _, points, normals = ammonite
     seen = np.isfinite(points[..., 0])
     other = trimesh.creation.box((120, 100, 70))
-    with pytest.raises(SlviewerError):
+    with pytest.raises(SlviewerError, match="see that it shows this part"):
         deviation(points[seen][::3], Mesh(other.vertices, other.faces), normals=normals[seen][::3])
     with pytest.raises(InputError, match="triangles"):
         NominalSurface(Mesh(np.zeros((3, 3)), np.zeros((0, 3), int)))
