@@ -3,9 +3,14 @@
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from slviewer.errors import InputError
 from slviewer.inspection.quantities import Quantity
+from slviewer.registration.open3d_loader import open3d
+
+BAND = 12.0
+"""Spacings from the plane within which points are joined to triangles."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +68,27 @@ def section(vertices: np.ndarray, faces: np.ndarray, plane: CutPlane) -> list[np
     drawn = plane.drawn(places)
     lines = [_order_line(drawn[chain]) for chain in _join_segments(segments, len(edges))]
     return sorted(lines, key=lambda line: -float(np.linalg.norm(np.diff(line, axis=0), axis=1).sum()))
+
+
+def triangulate_near(points: np.ndarray, normals: np.ndarray, plane: CutPlane) -> tuple[np.ndarray, np.ndarray]:
+    """Return vertices (n, 3) and triangles (m, 3) between the points (k, 3) mm of a cloud near a plane, to cut them.
+
+    Balls roll over the points on the side of their ``normals`` (k, 3), three and six of the points' spacings in radius,
+    so that wider gaps stay open (Bernardini et al. 1999). Raises InputError where no points lie near the plane.
+    """
+    known = np.isfinite(normals).all(axis=1)
+    points, normals = points[known].astype(np.float64), normals[known].astype(np.float64)
+    some = points[:: max(1, len(points) // 2000)]
+    spacing = float(np.median(cKDTree(points).query(some, k=2)[0][:, 1])) if len(points) > 1 else 0.0
+    near = np.abs((points - plane.origin) @ plane.normal) < BAND * spacing
+    if np.count_nonzero(near) < 3:
+        raise InputError("The section's plane does not meet the surface: pick two points on it.")
+    o3d = open3d()
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points[near]))
+    cloud.normals = o3d.utility.Vector3dVector(normals[near])
+    radii = o3d.utility.DoubleVector([3.0 * spacing, 6.0 * spacing])
+    mesh = o3d.geometry.TriangleMesh.create_from_point_cloud_ball_pivoting(cloud, radii)
+    return points[near], np.asarray(mesh.triangles, np.int64)
 
 
 def _order_line(line: np.ndarray) -> np.ndarray:

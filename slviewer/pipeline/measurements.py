@@ -16,7 +16,7 @@ from slviewer.inspection.fitting import fit_feature
 from slviewer.inspection.quantities import Quantity
 from slviewer.inspection.regions import Region
 from slviewer.inspection.relations import distance, relation
-from slviewer.inspection.section import CutPlane, section
+from slviewer.inspection.section import CutPlane, section, triangulate_near
 from slviewer.inspection.uncertainty import Spread
 from slviewer.pipeline.measured_surface import MeasuredSurface, Place
 from slviewer.pipeline.open_session import SessionLike, opened
@@ -114,7 +114,12 @@ def add_section(session: SessionLike, on: MeasuredSurface, a: Place, b: Place, n
     ends = [on.picked(place)[0].place for place in (a, b)]
     middle = (ends[0] + ends[1]) / 2
     plane = CutPlane.through(ends[0], ends[1], -middle)
-    vertices, faces = triangulate_surface(on)
+    if on.organised or on.faces is not None:
+        vertices, faces = triangulate_surface(on)
+    elif on.normals is None:
+        raise InputError(f"{on.source} has neither triangles nor normals: merge the scans again")
+    else:
+        vertices, faces = triangulate_near(on.points, on.normals, plane)
     lines = section(vertices, faces, plane)
     heights = np.concatenate(lines)
     quantities = [

@@ -251,8 +251,16 @@ def test_a_merge_is_measured_on_too(folder, balls, regions) -> None:
     one = measurements.add_fit(folder, on, "sphere", ball_about(balls, region))
     assert abs(measurements.quantities_of(one)[0].value - RADIUS) < 0.05 and one.source == "merge/1"
     assert measurements.quantities_of(measurements.add_distance(folder, on, 0, 5))[0].sigma > 0
-    with pytest.raises(InputError, match="mesh"):
-        measurements.add_section(folder, on, 0, 5000)
+    ends = [
+        int(np.argmin(np.linalg.norm(on.points - c - [dx, 0, -20.0], axis=1))) for c in CENTRES[:1] for dx in (-15, 15)
+    ]
+    cut = measurements.add_section(folder, on, *ends)
+    plane, lines = measurements.section_lines(folder, cut.id)
+    (middle,) = plane.drawn(CENTRES[:1])
+    radii = np.concatenate([np.linalg.norm(line - middle, axis=1) for line in lines])
+    apart = abs(float((CENTRES[0] - plane.origin) @ plane.normal))
+    on_ball = radii[radii < RADIUS + 2]
+    assert len(on_ball) > 50 and np.median(on_ball) == pytest.approx(np.sqrt(RADIUS**2 - apart**2), abs=0.1)
     with pytest.raises(InputError, match="index"):
         measurements.add_point(folder, on, (3, 4))
     other = measurements.add_fit(folder, balls, "sphere", ball_about(balls, region))

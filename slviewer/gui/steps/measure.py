@@ -11,7 +11,7 @@ from slviewer.gui.measure_surface import SurfaceView
 from slviewer.gui.measure_tools import COMPARE, FIT, PICK, Tool
 from slviewer.gui.panel import PanelContext, StepPanel
 from slviewer.gui.scene import GHOST
-from slviewer.gui.widgets import Html, Text, Tone, alert, coloured, paragraph, to_html
+from slviewer.gui.widgets import Html, Text, alert, coloured, paragraph, to_html
 from slviewer.inspection.features import KINDS
 from slviewer.inspection.regions import Region
 from slviewer.pipeline.measured_surface import Place
@@ -134,15 +134,7 @@ class Panel(StepPanel):
         """React to clicks into the scene while the tool needs them; another step handles its own clicks."""
         if self._visible:
             change(self._escape, disabled=not self._tool.name)
-            self._scene.on_pick(self._handle_click if self._tool.clicks and not self._obstacle else None)
-
-    @property
-    def _obstacle(self) -> str:
-        """Why the tool cannot be used on the surface; empty where it can."""
-        on = self._surface.on
-        if self._tool.name != "Section" or on is None or on.organised or on.faces is not None:
-            return ""
-        return "This merge has no triangles to cut: measure on one of its scans."
+            self._scene.on_pick(self._handle_click if self._tool.clicks else None)
 
     def _handle_click(self, origin: np.ndarray, direction: np.ndarray) -> None:
         """Pick the point of the surface that a clicked ray meets."""
@@ -163,9 +155,8 @@ class Panel(StepPanel):
         """Show the instruction and the inputs of the tool, and the points picked with it."""
         tool = self._tool
         title = f"<b>{to_html(tool.name)}</b>: " if tool.name else ""
-        text = Html(title + to_html(self._obstacle or tool.instruction))
-        tone: Tone = "warning" if self._obstacle else "info"
-        self._instruction.set(alert(text, tone) if tool.name else paragraph(coloured(text, "dim")))
+        text = Html(title + to_html(tool.instruction))
+        self._instruction.set(alert(text, "info") if tool.name else paragraph(coloured(text, "dim")))
         change(self._end, visible=bool(tool.name))
         change(self._radius, visible=tool.fits)
         label = f"Fit {tool.name.lower()}" if tool.fits else "Fit"
