@@ -20,6 +20,7 @@ from slviewer.simulation.light import window
 from slviewer.simulation.mesh import MeshScene
 from slviewer.simulation.rig import SimulatedRig
 
+_CHUNK = 64  # vertices at a time, which bounds the memory
 _SAMPLES = 8
 """Samples of the pattern along each side of a patch: patches are wider than a stripe is fine."""
 _FINEST_MM, _COARSEST_MM = 0.3, 3.0
@@ -115,12 +116,16 @@ class ConcaveScene(MeshScene):
     @cached_property
     def _form_factors(self) -> np.ndarray:
         """(n, m) float32 in 0 ... 1: irradiance of each vertex by each patch of radiosity 1, by Lambert's formula."""
-        normals = self.vertex_normals
+        return self.form_factors(np.arange(len(self.vertices)))
+
+    def form_factors(self, chosen: np.ndarray) -> np.ndarray:
+        """Return (k, m) float32 in 0 ... 1: irradiance of the vertices ``chosen`` (k,) by each patch of radiosity 1."""
         corners = self.placed[self.patches]
         facing, _ = _normals_and_areas(corners)
-        out = np.zeros((len(normals), len(corners)), np.float32)
-        for first in range(0, len(normals), 256):
-            some = slice(first, first + 256)
+        out = np.zeros((len(chosen), len(corners)), np.float32)
+        for first in range(0, len(chosen), _CHUNK):
+            some = chosen[first : first + _CHUNK]
+            normals = self.vertex_normals[some]
             at = self.placed[some, None, None]
             to = corners[None] - at
             size = np.linalg.norm(to, axis=-1, keepdims=True)
@@ -130,10 +135,10 @@ class ConcaveScene(MeshScene):
             across = np.cross(to, after)
             sine = np.linalg.norm(across, axis=-1)
             angle = np.arctan2(sine, (to * after).sum(-1)) / np.maximum(sine, 1e-12)
-            factor = np.abs((angle[..., None] * across).sum(2) @ normals[some, :, None])[..., 0] / (2 * np.pi)
+            factor = np.abs((angle[..., None] * across).sum(2) @ normals[:, :, None])[..., 0] / (2 * np.pi)
             middle = corners.mean(axis=1)[None] - at[:, :, 0]
-            visible = ((middle * normals[some, None]).sum(-1) > 0) & ((middle * facing[None]).sum(-1) < 0)
-            out[some] = np.where(visible & ~beside, factor, 0)
+            visible = ((middle * normals[:, None]).sum(-1) > 0) & ((middle * facing[None]).sum(-1) < 0)
+            out[first : first + _CHUNK] = np.where(visible & ~beside, factor, 0)
         return out
 
     def _lobe(self, rig: SimulatedRig) -> np.ndarray:
