@@ -59,19 +59,18 @@ def multifrequency(
     return PatternSequence(projector, (*frames, Frame("texture")))
 
 
-def micro(projector: tuple[int, int], periods: int = 4) -> PatternSequence:
-    """Return phase steps at several periods from 12 to about 16 px, for surfaces that light themselves; x, y, white.
+def micro(projector: tuple[int, int]) -> PatternSequence:
+    """Return phase steps at four periods from 12 to at most 17 px, for surfaces that light themselves; x, y, white.
 
     Micro phase shifting (Gupta and Nayar, "Micro phase shifting", CVPR 2012): light that reaches a point by way of
     other surfaces, or through the material, averages over such narrow stripes and shifts no phase. There is no long
     period and no Gray code that it could mislead; beats of the periods replace them. The beats' ratios are equal, so
     that no unwrapping step is weaker than the others. Eight steps of the finest period, four of the others.
     """
-    if not 3 <= periods <= 6:
-        raise InputError(f"micro phase shifting with {periods} periods is not offered: choose 3 to 6")
+    periods = 4
     frames: list[Frame] = []
     for axis, extent in zip(AXES, projector, strict=True):
-        longest = max(1.1 * extent, 32.0)
+        longest = max(1.1 * extent, 700.0)  # of small projectors too: shorter beats need wider stripes
         ratio = (longest / MICRO_PX[1]) ** (1 / (periods - 1))
         differences = [1 / (longest / ratio**k) for k in range(periods - 1)]  # of neighbouring frequencies
         frequencies = [1 / MICRO_PX[0] - sum(differences[k:]) for k in range(periods)]
