@@ -1,34 +1,42 @@
 """From captures, or from a stored merge, to a mesh in a file."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from slviewer.errors import UsageError
 from slviewer.pipeline.export import check_export
-from slviewer.pipeline.export_shapes import merged_points, scan_cloud
-from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings, part
+from slviewer.pipeline.export_shapes import merge_name, merged_points, scan_cloud
+from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings, part, stage
 from slviewer.pipeline.merge import Merge, StartKind, merge
-from slviewer.pipeline.models import ModelName, check_accepted, warn_if_stale
+from slviewer.pipeline.models import ModelName, check_accepted, load_stereo, warn_if_stale
 from slviewer.pipeline.open_session import SessionLike, opened
 from slviewer.reconstruction.cloud import Cloud
-from slviewer.session.mesh_files import write_shape
+from slviewer.session.mesh_files import write_shape, write_textured
+from slviewer.session.store import Session
 from slviewer.surface.meshing import BuiltMesh, MeshingPlan, build_mesh
 from slviewer.surface.shapes import PointSet
+from slviewer.surface.texture import TexturedMesh, texture_mesh
 
+TEXTURED_TRIANGLES = 100_000
+"""To so many a mesh is thinned that gets a texture, unless another number is given."""
 MERGE = "merge/"
 """What the name of a merge that the session keeps begins with; its number follows, or nothing for the last one."""
 
 
 @dataclass(frozen=True, eq=False)
 class MeshResult:
-    """A mesh, its source, and the file that it was written to. ``merged``: the merge of several scans."""
+    """A mesh, its source, and the file that it was written to. ``merged``: the merge of several scans; ``textured``:
+    the mesh with its texture."""
 
     meshed: BuiltMesh
     sources: tuple[str, ...]
     out: Path
     merged: Merge | None = None
+    textured: TexturedMesh | None = None
 
     def to_json(self) -> dict[str, Any]:
         """The contract of ``mesh --json``."""
@@ -38,7 +46,10 @@ class MeshResult:
     def text(self) -> str:
         """Return the result as a report for the terminal."""
         lines = [] if self.merged is None else [self.merged.text()]
-        return "\n".join([*lines, f"{', '.join(self.sources)}: {self.meshed.text()}", f"-> {self.out}"])
+        lines.append(f"{', '.join(self.sources)}: {self.meshed.text()}")
+        if self.textured is not None:
+            lines.append(self.textured.text())
+        return "\n".join([*lines, f"-> {self.out}"])
 
 
 def mesh(
@@ -47,6 +58,7 @@ def mesh(
     out: Path | str | None = None,
     *,
     plan: MeshingPlan | None = None,
+    texture: int | None = None,
     model: ModelName | None = None,
     start: StartKind = "features",
     angle: float | None = None,
@@ -59,7 +71,8 @@ def mesh(
     Args:
         session: Session folder.
         names: One scan; several, to be merged into the frame of the first; or a merge of the session, as merge/1.
-        out: The file; by default a .ply in the session's exports.
+        out: The file; by default a .ply in the session's exports, with a texture a .glb.
+        texture: Side of a texture image, px, such as 2048, projected from the scans onto the mesh; for .glb and .obj.
         start: Initial alignment of several scans: features estimates it from the scans; turntable uses the angles of
             the turntable; identity assumes that they are nearly aligned already.
         angle: Degrees that the turntable turns from each scan to the next, with --start turntable; by default as stored
@@ -78,10 +91,16 @@ def mesh(
         raise UsageError("the method grid joins the pixels of one scan: name one, or use poisson or volume")
     if out is not None:
         check_export("mesh", Path(out).suffix.lower().removeprefix("."))
+    if texture is not None:
+        if out is not None and Path(out).suffix.lower() not in (".glb", ".obj"):
+            raise UsageError(f"{Path(out).name} holds no texture: end its name in .glb or .obj")
+        plan = plan or MeshingPlan()
+        plan = plan if plan.triangles is not None else replace(plan, triangles=TEXTURED_TRIANGLES)
     merged = None
     with opened(session) as store:
         check_accepted(store, accept_rejected)
-        path = Path(out) if out is not None else store.exports / f"{'_'.join(sources).replace('/', '_')}_mesh.ply"
+        suffix = ".ply" if texture is None else ".glb"
+        path = Path(out) if out is not None else store.exports / f"{'_'.join(sources).replace('/', '_')}_mesh{suffix}"
         path.parent.mkdir(parents=True, exist_ok=True)
         before = part(progress, 0, 0.5)
         shape: Cloud | PointSet
@@ -97,8 +116,50 @@ def mesh(
         else:
             warn_if_stale(store, warn)
             shape = scan_cloud(store, sources[0], model, before, warn, accept_rejected)
-    meshed = build_mesh(shape, plan, part(progress, 0.5, 0.95))
+        scans = {} if texture is None else _textured_scans(store, sources, shape, merged, model, warn, accept_rejected)
+        light = None if texture is None else _projector_place(store)
+    meshed = build_mesh(shape, plan, part(progress, 0.5, 0.95 if texture is None else 0.6))
+    notes = (f"of {', '.join(sources)}", *meshed.text().splitlines())
+    if texture is None:
+        progress(0.95, f"writing {path.name}")
+        write_shape(path, meshed.mesh, notes=notes)
+        progress(1.0, "meshed")
+        return MeshResult(meshed, sources, path, merged)
+    clouds, poses = {name: each[0] for name, each in scans.items()}, {name: each[1] for name, each in scans.items()}
+    painting = stage(progress, 0.6, 0.95, "projecting the scans onto the mesh")
+    textured = texture_mesh(meshed.mesh, clouds, poses, size=texture, light=light, progress=painting)
     progress(0.95, f"writing {path.name}")
-    write_shape(path, meshed.mesh, notes=(f"of {', '.join(sources)}", *meshed.text().splitlines()))
+    write_textured(path, textured.mesh, textured.uv, textured.image, (*notes, textured.text()))
     progress(1.0, "meshed")
-    return MeshResult(meshed, sources, path, merged)
+    return MeshResult(meshed, sources, path, merged, textured)
+
+
+def _textured_scans(
+    store: Session,
+    sources: Sequence[str],
+    shape: Cloud | PointSet,
+    merged: Merge | None,
+    model: ModelName | None,
+    warn: Warn,
+    accept_rejected: bool,
+) -> dict[str, tuple[Cloud, np.ndarray]]:
+    """Return the cloud of every scan that the mesh is made of, and its pose (4, 4) in the mesh's frame."""
+    if merged is not None:
+        poses = merged.alignment.T_reference_scan
+        return {name: (merged.clouds[name], poses[name]) for name in merged.fused.names}
+    if isinstance(shape, Cloud):
+        return {sources[0]: (shape, np.eye(4))}
+    meta = store.load_result(f"{MERGE}{merge_name(store, sources[0].removeprefix(MERGE))}", only=())[0]
+    placed = {name: np.array(pair["T_reference_scan"], np.float64) for name, pair in meta["pairs"].items()}
+    placed |= {meta["reference"]: np.eye(4)}
+    used = meta.get("model") or model
+    return {
+        name: (scan_cloud(store, name, used, ignore_progress, warn, accept_rejected), placed[name])
+        for name in meta["scans"]
+    }
+
+
+def _projector_place(store: Session) -> np.ndarray:
+    """Return the place (3,) mm of the projector's lens in the camera's frame."""
+    rig = load_stereo(store).rig
+    return np.asarray(-rig.R.T @ rig.t)

@@ -14,6 +14,7 @@ Files appear whole or not at all. In glTF y points up and the viewer looks along
 whose y points down and whose z points away, by half a turn about x, so that an object stands as the camera saw it.
 """
 
+import io
 from collections.abc import Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
@@ -91,6 +92,40 @@ def write_shape(
         encode = {"stl": _encode_stl, "obj": _encode_obj, "glb": _encode_glb, "3mf": _encode_3mf}[file_format]
         replace_file(path, encode(shape, notes))
     return path.stat().st_size
+
+
+def write_textured(path: str | Path, shape: Mesh, uv: np.ndarray, image: np.ndarray, notes: Sequence[str] = ()) -> int:
+    """Write a mesh with texture coordinates ``uv`` (n, 2) and its image (h, w, 3) uint8, and return the size in bytes.
+
+    As .glb one file in metres; as .obj in mm with an .mtl and a .png of that name beside it. Raises InputError for
+    another suffix.
+    """
+    from PIL import Image
+    from trimesh.visual.material import PBRMaterial
+    from trimesh.visual.texture import TextureVisuals
+
+    path = Path(path)
+    picture = Image.fromarray(image)
+    if (file_format := path.suffix.lower()) == ".glb":
+        material = PBRMaterial(baseColorTexture=picture, metallicFactor=0.0, roughnessFactor=1.0, doubleSided=True)
+        replace_file(path, _encode_glb(shape, notes, TextureVisuals(uv=uv, material=material)))
+        return path.stat().st_size
+    if file_format != ".obj":
+        raise InputError(f"{path.name}: a texture is kept by .glb and .obj: end its name in one of these")
+    buffer = io.BytesIO()
+    picture.save(buffer, format="PNG")
+    png, mtl = path.with_suffix(".png"), path.with_suffix(".mtl")
+    described = f"newmtl surface\nKa 1 1 1\nKd 1 1 1\nKs 0 0 0\nmap_Kd {png.name}\n"
+    for beside, content in ((png, buffer.getvalue()), (mtl, described.encode())):
+        replace_file(beside, content)
+    lines = [f"# {to_ascii(line)}" for line in (f"slviewer {__version__}: units mm", *notes)]
+    lines += [f"mtllib {mtl.name}", "usemtl surface"]
+    with arriving_file(path) as file:
+        file.write(("\n".join(lines) + "\n").encode("ascii"))
+        np.savetxt(file, shape.vertices, f"v %.{DECIMALS}f %.{DECIMALS}f %.{DECIMALS}f")
+        np.savetxt(file, uv, "vt %.7f %.7f")
+        np.savetxt(file, np.repeat(shape.faces + 1, 2, axis=1), "f %d/%d %d/%d %d/%d")
+    return sum(each.stat().st_size for each in (path, mtl, png))
 
 
 def estimated_bytes(
@@ -185,8 +220,9 @@ def _encode_3mf(shape: PointSet | Mesh, notes: Sequence[str]) -> bytes:
     return content
 
 
-def _encode_glb(shape: PointSet | Mesh, notes: Sequence[str]) -> bytes:
-    """Binary glTF 2.0 in metres; normals only if all are known, since glTF has no unknown ones."""
+def _encode_glb(shape: PointSet | Mesh, notes: Sequence[str], texture: Any = None) -> bytes:
+    """Binary glTF 2.0 in metres; normals only if all are known, since glTF has no unknown ones. ``texture``: trimesh's
+    visual that replaces the colours of the vertices."""
     import trimesh
     from trimesh.exchange.gltf import export_glb
 
@@ -201,12 +237,15 @@ def _encode_glb(shape: PointSet | Mesh, notes: Sequence[str]) -> bytes:
         tree["asset"] |= {"generator": f"slviewer {__version__}", "extras": {"notes": [*words, *notes]}}
         # scanned surfaces are open: they have no inside that need not be drawn
         roughness = {"metallicFactor": 0, "roughnessFactor": 1}
-        tree["materials"] = [{"doubleSided": True, "pbrMetallicRoughness": roughness}]
+        if texture is None:
+            tree["materials"] = [{"doubleSided": True, "pbrMetallicRoughness": roughness}]
         for mesh in tree["meshes"]:
             mesh["primitives"][0]["material"] = 0
 
-    scene = trimesh.Scene()
-    scene.add_geometry(_to_trimesh(shape, 1e-3), "surface", transform=np.diag([1.0, -1.0, -1.0, 1.0]))
+    scene, surface = trimesh.Scene(), _to_trimesh(shape, 1e-3)
+    if texture is not None:
+        surface.visual = texture
+    scene.add_geometry(surface, "surface", transform=np.diag([1.0, -1.0, -1.0, 1.0]))
     has_normals = shape.normals is not None and bool(np.isfinite(shape.normals).all())
     content: bytes = export_glb(scene, include_normals=has_normals, tree_postprocessor=describe)
     return content

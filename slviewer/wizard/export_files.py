@@ -7,6 +7,7 @@ from pathlib import Path
 
 from slviewer.pipeline.export import What, default_file_name, export
 from slviewer.pipeline.feedback import Warn
+from slviewer.pipeline.mesh import MERGE, mesh
 from slviewer.pipeline.models import accepts_rejected
 from slviewer.session import atomic
 from slviewer.session.names import safe_name
@@ -28,16 +29,36 @@ def staged_export(session: Session, name: str, report: Reporter) -> Iterator[Pat
 
 
 def export_file(
-    session: Session, what: What, name: str, file_format: str, plan: MeshingPlan | None, report: Reporter, warn: Warn
+    session: Session,
+    what: What,
+    name: str,
+    file_format: str,
+    plan: MeshingPlan | None,
+    texture: int | None,
+    report: Reporter,
+    warn: Warn,
 ) -> str:
-    """Write one file, as `pipeline.export.export` does; returns a sentence that begins with the file's name."""
-    with staged_export(session, default_file_name(what, name, file_format), report) as path:
-        accepts, progress = accepts_rejected(session), report.within(0, 0.98)
-        exported = export(
-            session, what, name, out=path, plan=plan, accept_rejected=accepts, progress=progress, warn=warn
+    """Write one file, as `pipeline.export.export` does; returns a sentence that begins with the file's name.
+
+    ``texture``: side of the image of a mesh, px; None for a mesh without one.
+    """
+    accepts, progress = accepts_rejected(session), report.within(0, 0.98)
+    if texture is None:
+        with staged_export(session, default_file_name(what, name, file_format), report) as path:
+            exported = export(
+                session, what, name, out=path, plan=plan, accept_rejected=accepts, progress=progress, warn=warn
+            )
+        words = exported.words
+    else:
+        source = f"{MERGE}{name}" if what == "merged-mesh" else name
+        path = session.exports / default_file_name(what, name, file_format)
+        made = mesh(
+            session, [source], path, plan=plan, texture=texture, accept_rejected=accepts, progress=progress, warn=warn
         )
+        assert made.textured is not None
+        words = "; ".join([*made.meshed.text().splitlines(), made.textured.text()])
     report(1.0, "exported")
-    return f"{path.name} is ready to download: {exported.words}"
+    return f"{path.name} is ready to download: {words}"
 
 
 def list_exports(session: Session) -> tuple[ExportView, ...]:

@@ -142,10 +142,17 @@ class ResultRequests(RequestHandler):
             self.align(name)
 
     @request("Exporting")
-    def export(self, what: What, name: str = "", file_format: str = "", plan: MeshingPlan | None = None) -> None:
+    def export(
+        self,
+        what: What,
+        name: str = "",
+        file_format: str = "",
+        plan: MeshingPlan | None = None,
+        texture: int | None = None,
+    ) -> None:
         """Write a file into the session's exports. `export.FORMATS` lists what can be exported and the formats, the
         first is the default. `name`: the scan of a cloud or a mesh, the model of coefficients; a merge is the current
-        one. `plan`: how to mesh.
+        one. `plan`: how to mesh; `texture`: side of its image, px, of a .glb or .obj.
         """
         store, view = self._engine.store, self._engine.publisher.refresh().session
         chosen = file_format or FORMATS.get(what, ("",))[0]
@@ -158,7 +165,7 @@ class ResultRequests(RequestHandler):
             if view is None or view.merge is None:
                 raise InputError("there is no merge yet: merge scans first")
             name = view.merge.name
-        self._submit("Exporting", partial(export_file, store, what, name, chosen, plan, warn=self._warn), str)
+        self._submit("Exporting", partial(export_file, store, what, name, chosen, plan, texture, warn=self._warn), str)
 
     def report(self) -> bool:
         """Write the HTML report into the exports."""

@@ -218,7 +218,7 @@ def merge_turn(session: Session, names: list[str], report: Reporter, warn: Warn)
     merged = align_turn(partial(merge_scans, session, names, names[0], report_merge, warn), warn)
     number = numbered_results(session, "merge")[-1].removeprefix("merge/")
     try:
-        words = export_file(session, "merged-mesh", number, "ply", WATERTIGHT, report.within(0.7, 1), warn)
+        words = export_file(session, "merged-mesh", number, "ply", WATERTIGHT, None, report.within(0.7, 1), warn)
     except Cancelled:
         raise
     except SlviewerError as error:

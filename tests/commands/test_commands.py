@@ -73,6 +73,20 @@ def test_reconstruct_a_board_pose_and_a_scan(calibrated: dict, session: Path, ru
     assert status == 1 and "axis" in error
 
 
+def test_a_mesh_with_a_texture(calibrated: dict, session: Path, run: Run, tmp_path: Path) -> None:
+    out = tmp_path / "part.glb"
+    status, text, _ = run("mesh", session, "object_r2", "--texture", "512", "--model", "stereo", "--out", out)
+    assert status == 0 and "texture of 512x512 px" in text
+    part = trimesh.load(out, force="mesh")
+    image, uv = np.asarray(part.visual.material.baseColorTexture)[..., 0].astype(float), np.asarray(part.visual.uv)
+    at = (((1 - uv[:, 1]) * 512).astype(int).clip(0, 511), (uv[:, 0] * 512).astype(int).clip(0, 511))
+    grey = image[at]  # of the object, whose reflectance is the same everywhere
+    middle = np.abs(grey / np.median(grey) - 1)
+    assert 0.005 < np.median(middle) < 0.05
+    status, _, error = run("mesh", session, "object_r2", "--texture", "512", "--out", tmp_path / "part.stl")
+    assert status == 2 and ".glb or .obj" in error
+
+
 def test_merge_the_object(calibrated: dict, session: Path, run: Run, tmp_path: Path) -> None:
     ply, out = session / "exports" / "merged_1.ply", tmp_path / "merge.json"
     status, text, _ = run("merge", session, "object_r1", "object_r2", "--reference", "object_r3", "--json", out)

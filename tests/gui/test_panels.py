@@ -213,6 +213,15 @@ def test_scans_are_reconstructed_asked_merged_and_exported(
     expect(
         page.get_by_text(re.compile(r"^object_r2: (5\d{3}|6000) triangles by grid.*smoothing moved the surface by"))
     ).to_be_visible()
+    choose(page, "Texture", "1024 px")
+    button(page, "Write again").click()
+    expect(page.get_by_text(re.compile("texture of 1024x1024 px"))).to_be_visible(timeout=120_000)
+    assert operator.wait_until_idle() is not None
+    with page.expect_download() as download:
+        page.get_by_role("link", name="Download object_r2_mesh.glb").click(timeout=40_000)
+    download.value.save_as(tmp_path / "textured.glb")
+    part = trimesh.load(tmp_path / "textured.glb", force="mesh")
+    assert np.asarray(part.visual.material.baseColorTexture).shape[:2] == (1024, 1024)
     button(page, "Write calibration").click()
     expect(page.get_by_text("calibration.yml").first).to_be_visible()
     choose(page, "Content", "poses")

@@ -19,6 +19,7 @@ from slviewer.pipeline.export import (
     estimate_file_bytes,
 )
 from slviewer.session.atomic import format_bytes
+from slviewer.session.mesh_files import MESH_FORMATS, POINT_FORMATS
 from slviewer.surface.meshing import MeshingPlan, Method
 from slviewer.wizard import result_views
 from slviewer.wizard.snapshot import ExportView, SessionView, Snapshot
@@ -48,15 +49,15 @@ NUMBERS: dict[What, tuple[str, str]] = {
 }
 """Other exports than shapes: the choice, and its content."""
 _QUIET = "color:var(--mantine-color-anchor);font-weight:600;text-decoration:none"
-_SHAPED = {"ply", "stl", "obj", "glb", "xyz"}
-
-
+_SHAPED = {*POINT_FORMATS, *MESH_FORMATS}
+TEXTURED_FORMATS = ("glb", "obj")
 METHODS: dict[Method, str] = {
     "grid": "pixel grid",
     "poisson": "Poisson",
     "volume": "volumetric mean",
 }
 SMALL, OPEN, SIZED, CLOSED = "fill small", "keep open", "fill up to size", "watertight"
+TEXTURES = {"none": None, "1024 px": 1024, "2048 px": 2048, "4096 px": 4096}
 SMOOTHING = {"none": 0, "light": 5, "strong": 20}
 """Number of iterations."""
 
@@ -120,6 +121,9 @@ class Panel(StepPanel):
             self._as: Any = gui.add_dropdown("Type", (POINTS, MESH))
             self._mesh = MeshInputs(context, self._describe)
             self._shape_format = Choice(gui, "File type")
+            self._texture = gui.add_dropdown(
+                "Texture", tuple(TEXTURES), hint="An image of the surface, projected from the scans; thins the mesh"
+            )
             self._shape_note = Text(gui)
             self._shape_link = Text(gui)
             self._shape_result = Text(gui)
@@ -143,6 +147,7 @@ class Panel(StepPanel):
                 hint="Versions, settings, logs and thumbnails for a bug report; no frames",
             )  # fmt: skip
         self._as.on_update(context.callback(self._describe))
+        self._texture.on_update(context.callback(self._describe))
         for choice in (self._source, self._shape_format, self._numbers, self._number_format):
             choice.on_change(context.callback(self._describe))
 
@@ -190,6 +195,7 @@ class Panel(StepPanel):
         mesh = what in ("mesh", "merged-mesh")
         self._mesh.draw(mesh and bool(name), what == "merged-mesh")
         self._shape_format.offer([(each, FORMAT_NAMES[each]) for each in FORMATS[what]])
+        change(self._texture, visible=bool(name) and mesh and self._shape_format.value in TEXTURED_FORMATS)
         if name:
             chosen = self._shape_format.value
             file = _get_export(session, default_file_name(what, name, chosen))
@@ -258,7 +264,9 @@ class Panel(StepPanel):
         what, name = self._get_shape()
         if name:
             plan = self._mesh.plan() if what in ("mesh", "merged-mesh") else None
-            self._operator.export(what, name, self._shape_format.value, plan)
+            chosen = self._shape_format.value
+            texture = TEXTURES[self._texture.value] if plan is not None and chosen in TEXTURED_FORMATS else None
+            self._operator.export(what, name, chosen, plan, texture)
 
     def _request_numbers(self) -> None:
         """Request the file of the chosen numbers: calibration, poses or coefficients."""

@@ -1,0 +1,229 @@
+"""A mesh with a texture: an image of its surface, projected from the scans that saw it.
+
+Every texel takes the mean of the scans that see it, weighted by how squarely they look at it, by their noise and by the
+distance to their border; scans in whose way something stands are left out. Exposures are equalised over what two scans
+saw. The image shows the surface's reflectance where the light's place is known: what a scan sees falls with the cosine
+of the projector's angle and the square of its distance, which is divided out.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from scipy.ndimage import distance_transform_edt
+
+from slviewer.errors import InputError, SlviewerError
+from slviewer.geometry.polynomial import monomials
+from slviewer.geometry.rigid import move_points
+from slviewer.reconstruction.cloud import Cloud
+from slviewer.registration.open3d_loader import open3d
+from slviewer.surface.agreement import colour_gains, compare_views
+from slviewer.surface.shapes import Mesh
+from slviewer.surface.view import View, prepare_view
+
+SIZES_PX = (512, 8192)
+"""Least and largest side of a texture."""
+MOST_TRIANGLES = 150_000
+"""More take minutes to unfold."""
+_GUTTER_PX = 4.0
+_STRETCH = 1 / 6
+_DEGREE = 5  # of `View.to_pixel`
+_MIN_COSINE = 0.15
+_GATE = 3.0  # spacings of a scan within which its surface is the mesh's
+_NOMINAL_MM = 600.0  # distance from the light of unchanged brightness; the image is scaled in the end
+_CHUNK = 1 << 14  # OpenCV samples images of up to 32,767 rows
+
+
+@dataclass(frozen=True, eq=False)
+class TexturedMesh:
+    """A mesh whose vertices repeat along seams, ``uv`` (n, 2) of each, from the image's lower left corner, and its
+    ``image`` (h, w, 3) uint8 RGB.
+
+    ``seen``: share of the surface that a scan shows; the rest takes the nearest colour. ``mm_per_texel``: mean side of
+    a texel on the surface; ``charts``: pieces that it was unfolded into; ``seams``: share of edges along their borders.
+    """
+
+    mesh: Mesh
+    uv: np.ndarray
+    image: np.ndarray
+    seen: float
+    mm_per_texel: float
+    charts: int
+    seams: float
+
+    def text(self) -> str:
+        """Describe the texture in a sentence."""
+        height, width = self.image.shape[:2]
+        return (
+            f"texture of {width}x{height} px, {self.mm_per_texel:.3f} mm per pixel, in {self.charts} charts with seams "
+            f"along {100 * self.seams:.1f} % of the edges; no scan sees {100 * (1 - self.seen):.1f} % of the surface"
+        )
+
+
+def texture_mesh(
+    mesh: Mesh,
+    scans: Mapping[str, Cloud],
+    T_mesh_scan: Mapping[str, np.ndarray],
+    *,
+    size: int = 2048,
+    light: np.ndarray | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> TexturedMesh:
+    """Unfold a mesh, and project the scans' textures onto it.
+
+    ``scans``: organised clouds with textures, by name; ``T_mesh_scan``: their poses (4, 4) mm in the mesh's frame.
+    ``size``: side of the image, px. ``light`` (3,) mm: the projector's place in the cameras' frame, whose shading is
+    removed; kept where it is None. Raises InputError for a scan without a texture, a mesh that is too large, or sizes
+    out of range; SlviewerError where the mesh cannot be unfolded.
+    """
+    report = progress or (lambda share: None)
+    if not SIZES_PX[0] <= size <= SIZES_PX[1]:
+        raise InputError(f"a texture of {size} px cannot be made: give {SIZES_PX[0]} to {SIZES_PX[1]}")
+    if len(mesh.faces) > MOST_TRIANGLES:
+        raise InputError(
+            f"the mesh has {len(mesh.faces):,} triangles, too many to unfold: thin it to {MOST_TRIANGLES:,} or fewer"
+        )
+    for name, scan in scans.items():
+        if scan.texture is None:
+            raise InputError(f"{name} has no texture: capture it with a white image among its patterns")
+    views = {name: prepare_view(name, cloud, T_mesh_scan[name]) for name, cloud in scans.items()}
+    gains = colour_gains(views, compare_views(views, lambda share: None)) if len(views) > 1 else None
+    report(0.2)
+    unfolded, corners, charts = _unfold(mesh, size)
+    report(0.5)
+    places, normals = _bake_places(unfolded, size)
+    chart = np.isfinite(places[..., 0])
+    colours, weight = _blend(places[chart], normals[chart], views, gains, light, lambda s: report(0.5 + 0.4 * s))
+    image, seen = np.zeros((size, size, 3), np.float32), np.zeros((size, size), bool)
+    image[chart], seen[chart] = colours, weight > 0
+    if not seen.any():
+        raise SlviewerError("no scan shows the surface: do the mesh and the scans belong together?")
+    share = float(np.mean(weight > 0))
+    nearest = distance_transform_edt(~seen, return_distances=False, return_indices=True)
+    image = image[tuple(nearest)]
+    image *= 250.0 / max(float(np.percentile(image[seen], 99.5)), 1e-6)
+    report(0.95)
+    vertices, faces, uv, kept = _split_vertices(mesh, corners)
+    sides = mesh.vertices[mesh.faces].astype(np.float64)
+    area = np.linalg.norm(np.cross(sides[:, 1] - sides[:, 0], sides[:, 2] - sides[:, 0]), axis=1).sum() / 2
+    split = Mesh(
+        vertices,
+        faces,
+        None if mesh.normals is None else mesh.normals[kept],
+        None,
+        None if mesh.sigma_mm is None else mesh.sigma_mm[kept],
+    )
+    report(1.0)
+    return TexturedMesh(
+        split,
+        uv,
+        np.clip(image + 0.5, 0, 255).astype(np.uint8),
+        share,
+        float(np.sqrt(area / np.count_nonzero(chart))),
+        charts,
+        _seam_share(mesh.faces, faces),
+    )
+
+
+def _unfold(mesh: Mesh, size: int) -> tuple[Any, np.ndarray, int]:
+    """Return Open3D's mesh with an atlas, the texture coordinates (m, 3, 2) of its triangles, and its charts."""
+    o3d = open3d()
+    unfolded = o3d.t.geometry.TriangleMesh(
+        np.ascontiguousarray(mesh.vertices, np.float32), np.ascontiguousarray(mesh.faces, np.int64)
+    )
+    try:
+        _, charts, _ = unfolded.compute_uvatlas(size=size, gutter=_GUTTER_PX, max_stretch=_STRETCH)
+    except RuntimeError as error:
+        raise SlviewerError(
+            "the mesh cannot be unfolded, as edges of it join more than two triangles: mesh it with the method poisson"
+        ) from error
+    return unfolded, unfolded.triangle.texture_uvs.numpy().astype(np.float64), int(charts)
+
+
+def _bake_places(unfolded: Any, size: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the place (h, w, 3) mm of each texel and the unit normal there; NaN outside of the charts."""
+    unfolded.compute_vertex_normals()
+    baked = unfolded.bake_vertex_attr_textures(
+        size, {"positions", "normals"}, margin=1, fill=float("nan"), update_material=False
+    )
+    normals = baked["normals"].numpy()
+    return baked["positions"].numpy(), normals / np.linalg.norm(normals, axis=-1, keepdims=True)
+
+
+def _blend(
+    places: np.ndarray,
+    normals: np.ndarray,
+    views: Mapping[str, View],
+    gains: Mapping[str, float] | None,
+    light: np.ndarray | None,
+    report: Callable[[float], None],
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the mean colours (n, 3) float32 of texels and their weights (n,), 0 where no view sees them."""
+    total, weight = np.zeros((len(places), 3), np.float64), np.zeros(len(places), np.float64)
+    for k, (name, view) in enumerate(views.items()):
+        gain = 1.0 if gains is None else gains[name]
+        for first in range(0, len(places), _CHUNK):
+            report((k + first / len(places)) / len(views))
+            part = slice(first, first + _CHUNK)
+            colours, own = _look(places[part], normals[part], view, light)
+            total[part] += gain * own[:, None] * colours
+            weight[part] += own
+    return (total / np.maximum(weight, 1e-12)[:, None]).astype(np.float32), weight
+
+
+def _look(
+    places: np.ndarray, normals: np.ndarray, view: View, light: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return what a view shows of places (n, 3) with normals: colours (n, 3), and weights (n,), 0 of what it misses."""
+    points = move_points(np.linalg.inv(view.T), places.astype(np.float64))
+    facing = normals @ view.T[:3, :3]
+    cosine = -np.sum(facing * points, axis=1) / np.linalg.norm(points, axis=1)
+    rays = points[:, :2] / points[:, 2:]
+    A = monomials((rays - view.to_pixel[:2]) / view.to_pixel[2:4], _DEGREE)
+    pixels = (A @ view.to_pixel[4:].reshape(2, -1).T).astype(np.float32)
+
+    def sample(image: np.ndarray, how: int = cv2.INTER_LINEAR) -> np.ndarray:
+        """Return an image at the pixels, NaN outside."""
+        outside = (np.nan,) * 4
+        found = cv2.remap(image, pixels[:, :1], pixels[:, 1:], how, borderValue=outside)
+        return np.asarray(found)[:, 0]
+
+    away = np.sum((points - sample(view.points, cv2.INTER_NEAREST)) * facing, axis=1)
+    inside = (np.abs((rays - view.to_pixel[:2]) / view.to_pixel[2:4]) <= 1.05).all(axis=1)
+    with np.errstate(invalid="ignore"):
+        sees = inside & (cosine > _MIN_COSINE) & (np.abs(away) < _GATE * view.spacing)
+    assert view.colours is not None
+    colours = sample(view.colours.astype(np.float32)).astype(np.float64)
+    weight = sample(view.inner).astype(np.float64) * cosine**2 / sample(view.noise, cv2.INTER_NEAREST) ** 2
+    if light is not None:
+        to_light = light - points
+        distance = np.linalg.norm(to_light, axis=1)
+        lit = np.sum(facing * to_light, axis=1) / distance
+        with np.errstate(invalid="ignore"):
+            sees &= lit > _MIN_COSINE
+        colours *= ((distance / _NOMINAL_MM) ** 2 / np.maximum(lit, _MIN_COSINE))[:, None]
+        weight *= np.maximum(lit, 0.0) ** 2  # the noise grows as the shading is divided out
+    sees &= np.isfinite(weight) & np.isfinite(colours).all(axis=1)
+    return np.where(sees[:, None], colours, 0.0), np.where(sees, weight, 0.0)
+
+
+def _split_vertices(mesh: Mesh, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return vertices, one for every uv of the mesh's, faces, uv (n, 2), and which of the mesh's vertices each is."""
+    every = np.column_stack([mesh.faces.ravel(), np.round(corners.reshape(-1, 2) * (1 << 20))]).astype(np.int64)
+    unique, first, inverse = np.unique(every, axis=0, return_index=True, return_inverse=True)
+    kept = unique[:, 0]
+    return mesh.vertices[kept], inverse.reshape(-1, 3), corners.reshape(-1, 2)[first].astype(np.float32), kept
+
+
+def _seam_share(before: np.ndarray, after: np.ndarray) -> float:
+    """Return the share of a mesh's edges along which its unfolded triangles ``after`` (m, 3) come apart."""
+
+    def edges(faces: np.ndarray) -> int:
+        """Return the number of different edges."""
+        sides = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64), axis=1)
+        return len(np.unique(sides, axis=0))
+
+    whole = edges(before)
+    return (edges(after) - whole) / whole

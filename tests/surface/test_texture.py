@@ -1,0 +1,112 @@
+"""Textures: what the scans show comes to its place, without shading, gains, seams or what is hidden."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from ball_scans import RADIUS, SIDES, ball, looking_from
+
+from slviewer.errors import InputError
+from slviewer.geometry.rigid import move_points
+from slviewer.reconstruction.cloud import Cloud
+from slviewer.registration.open3d_loader import open3d
+from slviewer.session.mesh_files import write_textured
+from slviewer.surface.shapes import Mesh
+from slviewer.surface.texture import TexturedMesh, texture_mesh
+
+LIGHT = np.array([120.0, 10.0, -5.0])
+AWAY = 300.0
+
+
+def albedo(points: np.ndarray) -> np.ndarray:
+    """Reflectance of places on the ball: waves 15 mm long, and one half darker."""
+    return 0.5 + 0.2 * np.sin(points[..., 0] / 2.4) * np.cos(points[..., 1] / 2.4) + 0.15 * np.sign(points[..., 2])
+
+
+def painted(name: str, gain: float) -> Cloud:
+    """A scan of the painted ball, lit from beside the camera."""
+    cloud = ball(AWAY, 0.02, 1, size=(200, 150))
+    places = move_points(looking_from(SIDES[name], AWAY), cloud.points.reshape(-1, 3)).reshape(cloud.points.shape)
+    normals = (cloud.points - [0, 0, AWAY]) / RADIUS
+    to_light = LIGHT - cloud.points
+    distance = np.linalg.norm(to_light, axis=-1)
+    lit = np.clip(np.sum(normals * to_light, axis=-1) / distance, 0, None)
+    grey = gain * 300 * albedo(places) * lit * (AWAY / distance) ** 2
+    grey += np.random.default_rng(2).normal(size=grey.shape)
+    return replace(cloud, texture=np.clip(np.nan_to_num(grey), 0, 255).astype(np.uint8))
+
+
+@pytest.fixture(scope="module")
+def textured() -> TexturedMesh:
+    names = dict(zip(SIDES, (1.0, 0.8, 0.9, 0.7, 1.0, 0.85), strict=True))
+    scans = {name: painted(name, gain) for name, gain in names.items()}
+    sphere = trimesh.creation.icosphere(5, RADIUS)
+    poses = {name: looking_from(SIDES[name], AWAY) for name in scans}
+    return texture_mesh(Mesh(sphere.vertices, sphere.faces), scans, poses, size=512, light=LIGHT)
+
+
+def shown(textured: TexturedMesh) -> np.ndarray:
+    """The image's red at each vertex."""
+    size = len(textured.image)
+    column, row = textured.uv[:, 0] * size - 0.5, (1 - textured.uv[:, 1]) * size - 0.5
+    at = np.clip(np.round(row), 0, size - 1).astype(int), np.clip(np.round(column), 0, size - 1).astype(int)
+    return textured.image[at][:, 0].astype(float)
+
+
+def test_the_texture_is_the_reflectance_without_shading_and_exposures(textured: TexturedMesh) -> None:
+    red, truth = shown(textured), albedo(textured.mesh.vertices)
+    away_from_step = np.abs(textured.mesh.vertices[:, 2]) > 3
+    factor = np.sum(red * truth) / np.sum(truth**2)
+    error = (red / factor - truth)[away_from_step]
+    assert 0.005 < np.sqrt(np.mean(error**2)) < 0.03  # of 0.5; texels are 1 mm wide
+    assert np.percentile(np.abs(error), 99) < 0.1
+    assert textured.seen > 0.97 and 0.3 < textured.mm_per_texel < 1.5
+    assert 1 <= textured.charts < 60 and 0 < textured.seams < 0.3
+    assert len(textured.uv) == len(textured.mesh.vertices) >= 10242 and "px" in textured.text()
+
+
+@pytest.mark.parametrize("suffix", ["obj", "glb"])
+def test_trimesh_and_open3d_read_mesh_and_image(textured: TexturedMesh, tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"part.{suffix}"
+    size = write_textured(path, textured.mesh, textured.uv, textured.image, ("a note",))
+    assert size == sum(each.stat().st_size for each in tmp_path.iterdir())
+    found = trimesh.load(path, force="mesh", process=False, maintain_order=True)
+    assert len(found.faces) == len(textured.mesh.faces)
+    assert found.extents.max() * (1000 if suffix == "glb" else 1) == pytest.approx(2 * RADIUS, rel=1e-3)
+    uv = np.asarray(found.visual.uv)
+    assert uv.min() >= 0 and uv.max() <= 1
+    material = found.visual.material
+    image = np.asarray(material.baseColorTexture if suffix == "glb" else material.image)
+    assert np.array_equal(image[..., :3], textured.image)
+    o3d = open3d()
+    model = o3d.io.read_triangle_model(str(path))
+    (material,) = model.materials
+    assert np.asarray(material.albedo_img).shape[:2] == textured.image.shape[:2]
+    assert len(model.meshes[0].mesh.triangles) == len(textured.mesh.faces)
+    if suffix == "obj":
+        assert {each.name for each in tmp_path.iterdir()} == {"part.obj", "part.mtl", "part.png"}
+
+
+def test_what_stands_in_the_way_leaves_no_trace() -> None:
+    """A view that sees another surface at a place does not colour it."""
+    scan = painted("front", 1.0)
+    sphere = trimesh.creation.icosphere(4, RADIUS)
+    nearer = trimesh.creation.icosphere(4, RADIUS + 5)  # not what the scan saw
+    pose = {"front": looking_from(SIDES["front"], AWAY)}
+    both = trimesh.util.concatenate([sphere, nearer.apply_translation([100, 0, 0])])
+    found = texture_mesh(Mesh(both.vertices, both.faces), {"front": scan}, pose, size=512)
+    assert 0.1 < found.seen < 0.25  # less than half of one ball of two
+
+
+def test_what_cannot_be_textured_is_refused(tmp_path: Path, textured: TexturedMesh) -> None:
+    sphere = trimesh.creation.icosphere(2, RADIUS)
+    mesh = Mesh(sphere.vertices, sphere.faces)
+    scan, pose = painted("front", 1.0), {"front": looking_from(SIDES["front"], AWAY)}
+    with pytest.raises(InputError, match="no texture"):
+        texture_mesh(mesh, {"front": replace(scan, texture=None)}, pose)
+    with pytest.raises(InputError, match="512 to 8192"):
+        texture_mesh(mesh, {"front": scan}, pose, size=100)
+    with pytest.raises(InputError, match=r"\.glb and \.obj"):
+        write_textured(tmp_path / "part.stl", textured.mesh, textured.uv, textured.image)
