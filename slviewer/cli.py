@@ -77,6 +77,8 @@ COMMANDS = Commands(
             read_command, "pipeline.decode:decode", "session", "capture", names={"file_format": "format"}
         ),
         "reconstruct": partial(read_command, "pipeline.reconstruct:reconstruct", "session", "capture"),
+        "region": partial(read_command, "pipeline.edit:set_region", "session"),
+        "edit": partial(read_command, "pipeline.edit:edit_scan", "session", "scan", options=[JSON]),
         "verify": partial(
             read_command,
             "pipeline.verify:verify",

@@ -19,10 +19,12 @@ from slviewer.pipeline.capture_phases import decode_captures
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
 from slviewer.pipeline.models import check_accepted, load_model, preferred_model
 from slviewer.pipeline.open_session import SessionLike, opened
+from slviewer.pipeline.scan_edits import restrict_cloud
 from slviewer.reconstruction.cloud import Cloud, choose_pixels
 from slviewer.reconstruction.reconstruct import normals
 from slviewer.registration.refusal import Refused
 from slviewer.registration.static_scene import register_object
+from slviewer.session.scan_edits import load_region
 from slviewer.session.store import Session
 
 FOLDER = "placement"
@@ -236,6 +238,7 @@ def _load_cloud(store: Session, name: str, clouds: dict[str, Cloud], warn: Warn)
             model = load_model(store, preferred_model(store))
             ((shot, _, phases),) = decode_captures(store, [name], warn)
             cloud = capture_cloud(store, model, shot, phases, warn=warn)
+        cloud = restrict_cloud(store, name, cloud, load_region(store))
         step = max(1, int(np.ceil(np.sqrt(cloud.sigma_z.size / _PIXELS))))
         clouds[name] = replace(
             cloud,

@@ -16,6 +16,7 @@ from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_w
 from slviewer.pipeline.models import ModelName, check_accepted, preferred_model, warn_if_stale
 from slviewer.pipeline.open_session import SessionLike, opened
 from slviewer.pipeline.report import report
+from slviewer.pipeline.scan_edits import refuse_region
 from slviewer.session.atomic import format_bytes
 from slviewer.session.mesh_files import IN_WORDS, MESH_FORMATS, POINT_FORMATS, estimated_bytes, write_shape
 from slviewer.session.reading import expand_user
@@ -106,6 +107,7 @@ def export(
     file_format: str = "",
     model: ModelName | None = None,
     plan: MeshingPlan | None = None,
+    roi: str = "",
     accept_rejected: bool = False,
     progress: Progress = ignore_progress,
     warn: Warn = ignore_warnings,
@@ -122,6 +124,8 @@ def export(
         file_format: ply, stl, obj, glb, 3mf, xyz, e57, yml, xml, json, ..., where --out is a folder or not given.
         model: Which calibration to make a cloud with, by default the one of the stored cloud, or the best; or which to
             write (of splined the pinhole and Brown lenses that come nearest, and their remaining error).
+        roi: Region of interest, outside of which points are ignored: x0,x1,y0,y1,z0,z1 in mm in the camera's frame
+            (x right, y down, z away), a TOML file, or off; by default the session's. A merge was cut when it was made.
         accept_rejected: Use the calibration although its verdict rejects it.
 
     The file is written whole or not at all.
@@ -137,10 +141,10 @@ def export(
             warn_if_stale(store, warn)
         if what in ("mesh", "merged-mesh"):
             words = _write_shape(
-                store, what, name, target, model, plan or MeshingPlan(), accept_rejected, progress, warn
+                store, what, name, target, model, plan or MeshingPlan(), accept_rejected, roi, progress, warn
             )
         elif what in ("cloud", "merge"):
-            words = _write_shape(store, what, name, target, model, None, accept_rejected, progress, warn)
+            words = _write_shape(store, what, name, target, model, None, accept_rejected, roi, progress, warn)
         elif what == "report":
             report(store, target, progress=progress, warn=warn)
             words = "report"
@@ -159,14 +163,16 @@ def _write_shape(
     model: str | None,
     plan: MeshingPlan | None,
     accept_rejected: bool,
+    roi: str,
     progress: Progress,
     warn: Warn,
 ) -> str:
     """Write a scan or a merge as points or a mesh, and return a description of what was written."""
     making = part(progress, 0, 0.8)
     if what in ("cloud", "mesh"):
-        made = scan_shape(store, name, model, plan, making, warn, accept_rejected)
+        made = scan_shape(store, name, model, plan, making, warn, accept_rejected, roi)
     else:
+        refuse_region(f"merge/{name}", roi)
         made = merge_shape(store, name, plan, making, warn)
     progress(0.85, f"writing {target.name}")
     write_shape(target, made.shape, scalars=made.scalars, notes=made.notes)

@@ -13,6 +13,7 @@ from slviewer.pipeline.feedback import Progress, Warn, part
 from slviewer.pipeline.models import frame_of, load_model, preferred_model
 from slviewer.pipeline.open_session import numbered_results
 from slviewer.pipeline.scale import describe_scale, scale_factor
+from slviewer.pipeline.scan_edits import resolve_region, restrict_cloud, restriction_notes
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.reconstruction.reconstruct import normals as grid_normals
 from slviewer.session.ply import Ply, read_ply
@@ -55,14 +56,16 @@ def scan_shape(
     progress: Progress,
     warn: Warn,
     accept_rejected: bool = False,
+    roi: str = "",
 ) -> DescribedShape:
     """A scan's measured points with normals, colours and sigmas, or where there is a ``plan`` a mesh of them."""
-    cloud = scan_cloud(store, name, model, part(progress, 0, 0.5), warn, accept_rejected)
+    cloud = scan_cloud(store, name, model, part(progress, 0, 0.5), warn, accept_rejected, roi)
     mask = cloud.mask
     if not mask.any():
         raise InputError(f"{name}: no pixel was measured: does the calibration belong to this camera and projector?")
     frame = f"frame: {frame_of(store, cloud.model)}, x right, y down, z away"
-    notes = (f"scan {name}, {frame}", *_model_notes(store, cloud.model))
+    restrictions = restriction_notes(store, [name], resolve_region(store, roi))
+    notes = (f"scan {name}, {frame}", *_model_notes(store, cloud.model), *restrictions)
     if plan is not None:
         return _describe_mesh(name, build_mesh(cloud, plan, part(progress, 0.5, 1)), notes)
     progress(0.7, "normals")
@@ -74,9 +77,25 @@ def scan_shape(
 
 
 def scan_cloud(
-    store: Session, name: str, model: str | None, progress: Progress, warn: Warn, accept_rejected: bool = False
+    store: Session,
+    name: str,
+    model: str | None,
+    progress: Progress,
+    warn: Warn,
+    accept_rejected: bool = False,
+    roi: str = "",
 ) -> Cloud:
-    """A capture's cloud: the stored one where it is up to date and of the requested model, else reconstructed."""
+    """A capture's cloud: the stored one where it is up to date and of the requested model, else reconstructed; without
+    what was deleted from it, and what lies outside of the region ``roi``, as `resolve_region` reads it."""
+    region = resolve_region(store, roi)
+    cloud = _whole_cloud(store, name, model, progress, warn, accept_rejected)
+    return restrict_cloud(store, name, cloud, region)
+
+
+def _whole_cloud(
+    store: Session, name: str, model: str | None, progress: Progress, warn: Warn, accept_rejected: bool
+) -> Cloud:
+    """Return a capture's cloud as `scan_cloud`, with all of its points."""
     capture, model, stored = store.load_capture(name), model or None, f"clouds/{name}"
     if store.has_result(stored) and is_up_to_date(store, stored):
         meta = store.load_result(stored, only=())[0]
@@ -112,6 +131,7 @@ def merge_shape(store: Session, name: str, plan: MeshingPlan | None, progress: P
     notes = (
         f"merge {name} of {', '.join(meta['scans'])}, frame: {frame_of(store, model)}, at {meta['reference']}",
         *_model_notes(store, model),
+        *meta.get("restrictions", ()),
     )
     if plan is None:
         note = "sigma: expected error along the normal, mm"

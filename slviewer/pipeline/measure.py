@@ -38,6 +38,7 @@ def measure(
     box: Sequence[float] = (),
     name: str = "",
     model: ModelName | None = None,
+    roi: str = "",
     accept_rejected: bool = False,
     progress: Progress = ignore_progress,
     warn: Warn = ignore_warnings,
@@ -54,6 +55,8 @@ def measure(
         box: The region to fit to: two corners x y z x y z, mm, in the camera's frame.
         name: What to call it.
         model: Which calibration to use; by default the best one available.
+        roi: Region of interest, outside of which points are ignored: x0,x1,y0,y1,z0,z1 in mm in the camera's frame
+            (x right, y down, z away), a TOML file, or off; by default the session's. A merge was cut when it was made.
         accept_rejected: Use the calibration although its verdict rejects it.
     """
     fitted = what in ("plane", "sphere", "cylinder")
@@ -63,7 +66,9 @@ def measure(
     if not fitted and len(at) not in (ends, 2 * ends):
         _raise_place_error(what, ends, "pixel u v")
     with opened(session, write=True) as store:
-        on = load_surface(store, scan, model=model, accept_rejected=accept_rejected, progress=progress, warn=warn)
+        on = load_surface(
+            store, scan, model=model, roi=roi, accept_rejected=accept_rejected, progress=progress, warn=warn
+        )
         if fitted:
             region = Region.ball(ball[:3], ball[3]) if ball else Region.box(box[:3], box[3:])
             return add_fit(store, on, what, region, name)  # type: ignore[arg-type]

@@ -15,8 +15,10 @@ from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_w
 from slviewer.pipeline.models import Model, check_accepted, load_model, preferred_model, warn_if_stale
 from slviewer.pipeline.open_session import SessionLike, opened
 from slviewer.pipeline.scale import load_scale_correction, scale_factor, scale_sigma
+from slviewer.pipeline.scan_edits import refuse_region
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.reconstruction.reconstruct import normals as grid_normals
+from slviewer.session.scan_edits import restriction_inputs
 from slviewer.session.store import Session
 
 MERGED = "merge/"
@@ -105,29 +107,39 @@ def load_surface(
     scan: str,
     *,
     model: str | None = None,
+    roi: str = "",
     accept_rejected: bool = False,
     progress: Progress = ignore_progress,
     warn: Warn = ignore_warnings,
 ) -> MeasuredSurface:
-    """Reconstruct a capture to measure on it, or read a stored merge, named ``merge/<number>``."""
+    """Reconstruct a capture to measure on it, or read a stored merge, named ``merge/<number>``; ``roi`` as in
+    `resolve_region`, for captures alone."""
     with opened(session) as store:
         if scan.startswith(MERGED):
+            refuse_region(scan, roi)
             return load_merged_surface(store, scan, warn)
         check_accepted(store, accept_rejected)
         warn_if_stale(store, warn)
-        cloud = scan_cloud(store, scan, model or preferred_model(store), progress, warn, accept_rejected)
-        measured_surface = surface_from_cloud(store, scan, cloud, load_model(store, cloud.model))
+        cloud = scan_cloud(store, scan, model or preferred_model(store), progress, warn, accept_rejected, roi)
+        fitted = load_model(store, cloud.model)
+        measured_surface = surface_from_cloud(store, scan, cloud, fitted, with_region=not roi)
         progress(1.0, "reconstructed")
     return measured_surface
 
 
-def surface_from_cloud(store: Session, scan: str, cloud: Cloud, fitted: Model) -> MeasuredSurface:
-    """A capture's cloud, made with one of the session's calibrations, as a surface to measure on."""
+def surface_from_cloud(
+    store: Session, scan: str, cloud: Cloud, fitted: Model, *, with_region: bool = True
+) -> MeasuredSurface:
+    """A capture's cloud, made with one of the session's calibrations, as a surface to measure on.
+
+    ``with_region``: whether it was cut by the session's region, where that is in effect.
+    """
     calibration = f"calibration/{fitted.name}"
     names = [scan, calibration]
     if load_scale_correction(store, fitted.name) is not None:
         names.append(f"scale/{fitted.name}")
-    inputs, scale = store.input_hashes(*names), scale_factor(store, fitted.name)
+    inputs = store.input_hashes(*names) | restriction_inputs(store, [scan], with_region=with_region)
+    scale = scale_factor(store, fitted.name)
     shared = None
     if isinstance(fitted, SplinedModel):
         shared = splined_shared(fitted.bundle, cloud.axis, scale, scale_sigma(store, fitted.name))

@@ -18,6 +18,7 @@ from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_w
 from slviewer.pipeline.models import ModelName, check_accepted, frame_of, load_model, preferred_model, warn_if_stale
 from slviewer.pipeline.open_session import SessionLike, next_number, opened
 from slviewer.pipeline.scale import describe_scale, scale_factor
+from slviewer.pipeline.scan_edits import resolve_region, restrict_cloud, restriction_notes
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.registration.markers import MeasuredMarkers, fit_marker_pose, marker_notes, measure_markers
 from slviewer.registration.multiway import Alignment, Pair, Starts
@@ -27,6 +28,7 @@ from slviewer.registration.refusal import Refused
 from slviewer.registration.static_scene import ObjectAlignment, SceneContradiction, register_object
 from slviewer.registration.turntable import TurntableAxis, shortest_turn
 from slviewer.session.ply import write_ply
+from slviewer.session.scan_edits import restriction_inputs
 from slviewer.session.store import Session
 from slviewer.surface.fuse import Fused, fuse
 
@@ -45,6 +47,7 @@ class Merge:
 
     ``scale`` describes the correction of scale in it; ``result_name`` is the stored result, if any.
     ``static_points``: by scan, how many points stand still while the object moves; ``contradictions`` of each pair.
+    ``restrictions``: edits and region that the scans were cut by, in words, and their hashes.
     In the file ``seen_by`` counts the scans that a point is the mean of, and ``source`` numbers the one that its place
     comes from, 0 for the first of ``fused.names``.
     """
@@ -57,6 +60,8 @@ class Merge:
     result_name: str = ""
     static_points: Mapping[str, int] = field(default_factory=dict)
     contradictions: Mapping[Pair, SceneContradiction] = field(default_factory=dict)
+    restrictions: tuple[str, ...] = ()
+    restriction_inputs: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def reference(self) -> str:
@@ -146,6 +151,7 @@ class Merge:
         if far:
             counted = ", ".join(f"{count} points of {name}" for name, count in far.items())
             lines.append(f"removed as far from everything else: {counted}")
+        lines += self.restrictions
         if self.scale:
             lines.append(self.scale)
         overlap_text = f"{100 * self.fused.shared:.0f} % of them seen by more than one scan"
@@ -168,6 +174,7 @@ def merge(
     poses: Mapping[str, np.ndarray] | None = None,
     picked: Picked | None = None,
     keep_background: bool = False,
+    roi: str = "",
     accept_rejected: bool = False,
     progress: Progress = ignore_progress,
     warn: Warn = ignore_warnings,
@@ -190,6 +197,8 @@ def merge(
         angle: Degrees that the turntable turns from each capture to the next, with --start turntable; by default as
             stored with the captures of `slviewer turn`.
         model: Which calibration to use; by default the best one available.
+        roi: Region of interest, outside of which points are ignored: x0,x1,y0,y1,z0,z1 in mm in the camera's frame
+            of each scan (x right, y down, z away), a TOML file, or off; by default the session's.
         accept_rejected: Use the calibration although its verdict rejects it.
 
     Python alone: ``axis`` of the turntable, estimated where it is not given; ``poses`` (4, 4) by name, the initial
@@ -221,10 +230,12 @@ def merge(
         fitted = load_model(store, model or preferred_model(store))
         warn_if_stale(store, warn)
         check_capture_sizes(store, names)
-        scale, clouds = describe_scale(store, fitted.name), {}
+        scale, clouds, region = describe_scale(store, fitted.name), {}, resolve_region(store, roi)
+        restrictions = restriction_notes(store, names, region)
+        inputs = restriction_inputs(store, names, with_region=not roi)
         for i, (shot, frames, phases) in enumerate(decode_captures(store, names, warn)):
             progress(0.4 * i / len(names), f"reconstructing {shot.name}")
-            clouds[shot.name] = capture_cloud(
+            cloud = capture_cloud(
                 store,
                 fitted,
                 shot,
@@ -233,6 +244,7 @@ def merge(
                 accept_rejected=accept_rejected,
                 warn=warn,
             )
+            clouds[shot.name] = restrict_cloud(store, shot.name, cloud, region)
         if start == "markers":
             starts = replace(starts, markers=_measure_markers(clouds, warn))
         elif table_deg is not None:
@@ -253,14 +265,17 @@ def merge(
         scalars = {} if surface.sigma_mm is None else {"sigma": surface.sigma_mm}
         scalars |= {"seen_by": fused.seen_by, "source": fused.source}
         frame = f"{frame_of(store, fitted.name)}, at {reference}"
-        notes = (f"scans {', '.join(names)}, frame: {frame}", f"calibration {fitted.name}")
+        notes = (f"scans {', '.join(names)}, frame: {frame}", f"calibration {fitted.name}", *restrictions)
         number = 0 if out is not None else next_number(store, "merge")
         path = store.exports / f"merged_{number}.ply" if out is None else out
         path.parent.mkdir(parents=True, exist_ok=True)
         write_ply(path, surface.points, surface.colours, surface.normals, scalars, notes=notes)
         static_points = {name: int(mask.sum()) for name, mask in registered.static.items()}
         result_name = f"merge/{number}" if number else ""
-        result = Merge(alignment, fused, clouds, path, scale, result_name, static_points, registered.contradictions)
+        result = Merge(
+            alignment, fused, clouds, path, scale, result_name, static_points, registered.contradictions,
+            restrictions, inputs,
+        )  # fmt: skip
         if result.result_name:
             store.save_result(result.result_name, merge_record(store, result, fitted.name), {})
     progress(1.0, "merged")
@@ -359,7 +374,8 @@ def merge_record(store: Session, merged: Merge, model: str) -> dict[str, Any]:
         "model": model,
         "scale": merged.scale,
         "scales": {model: scale_factor(store, model)},
-        "inputs": store.input_hashes(*merged.fused.names, *calibrations),
+        "restrictions": list(merged.restrictions),
+        "inputs": {**store.input_hashes(*merged.fused.names, *calibrations), **merged.restriction_inputs},
     }
 
 

@@ -14,6 +14,7 @@ from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_w
 from slviewer.pipeline.merge import Merge, StartKind, merge
 from slviewer.pipeline.models import ModelName, check_accepted, load_stereo, warn_if_stale
 from slviewer.pipeline.open_session import SessionLike, opened
+from slviewer.pipeline.scan_edits import refuse_region
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.session.mesh_files import write_shape, write_textured
 from slviewer.session.store import Session
@@ -62,6 +63,7 @@ def mesh(
     model: ModelName | None = None,
     start: StartKind = "features",
     angle: float | None = None,
+    roi: str = "",
     accept_rejected: bool = False,
     progress: Progress = ignore_progress,
     warn: Warn = ignore_warnings,
@@ -78,6 +80,8 @@ def mesh(
         angle: Degrees that the turntable turns from each scan to the next, with --start turntable; by default as stored
             with the captures of `slviewer turn`.
         model: Which calibration to use; by default the best one available.
+        roi: Region of interest, outside of which points are ignored: x0,x1,y0,y1,z0,z1 in mm in the camera's frame
+            (x right, y down, z away), a TOML file, or off; by default the session's. A merge was cut when it was made.
         accept_rejected: Use the calibration although its verdict rejects it.
 
     ``merge/`` alone is the session's last merge. The points of merged scans are written next to the mesh.
@@ -108,14 +112,15 @@ def mesh(
             points = path.with_name(f"{path.stem}_points.ply")
             merged = merge(
                 store, sources, sources[0], points, model=model, start=start, angle=angle,
-                accept_rejected=accept_rejected, progress=before, warn=warn,
+                roi=roi, accept_rejected=accept_rejected, progress=before, warn=warn,
             )  # fmt: skip
             shape = merged.fused.surface
         elif sources[0].startswith(MERGE):
+            refuse_region(sources[0], roi)
             shape = merged_points(store, sources[0].removeprefix(MERGE), warn)
         else:
             warn_if_stale(store, warn)
-            shape = scan_cloud(store, sources[0], model, before, warn, accept_rejected)
+            shape = scan_cloud(store, sources[0], model, before, warn, accept_rejected, roi)
         scans = {} if texture is None else _textured_scans(store, sources, shape, merged, model, warn, accept_rejected)
         light = None if texture is None else _projector_place(store)
     meshed = build_mesh(shape, plan, part(progress, 0.5, 0.95 if texture is None else 0.6))

@@ -26,6 +26,7 @@ from slviewer.pipeline.models import (
 )
 from slviewer.pipeline.open_session import SessionLike, opened
 from slviewer.pipeline.scale import describe_scale
+from slviewer.pipeline.scan_edits import resolve_region, restrict_cloud, restriction_notes
 from slviewer.reconstruction.cloud import Cloud, choose_pixels
 from slviewer.reconstruction.mesh import triangulate_grid
 from slviewer.reconstruction.reconstruct import JUMP, normals
@@ -45,7 +46,8 @@ class Reconstruction:
     measures the board. ``scale`` describes the correction of scale in it; ``masked`` is the share of the
     pixels that were masked because no target pose illuminated what they look through, None for models that mask none.
     ``frame``: the one that the points are in, in words. ``raised``: the calibration's residuals over their predicted
-    noise, by which sigmas are raised.
+    noise, by which sigmas are raised. ``uncut``: the cloud before edits and region, where there are any, which
+    ``restrictions`` describes.
     """
 
     cloud: Cloud
@@ -57,6 +59,8 @@ class Reconstruction:
     masked: float | None = None
     frame: str = ""
     raised: float = 1.0
+    uncut: Cloud | None = None
+    restrictions: tuple[str, ...] = ()
 
     def text(self) -> str:
         """Return the result as a report for the terminal."""
@@ -77,6 +81,7 @@ class Reconstruction:
                 f"sigma was raised: the calibration's residuals in {cloud.axis} are {self.raised:.1f} times their "
                 "predicted noise, and what disturbs its phases disturbs this capture's as well"
             )
+        lines += self.restrictions
         if self.frame:
             lines.append(f"frame: {self.frame}")
         if self.scale:
@@ -98,6 +103,7 @@ def reconstruct(
     out: Path | str | None = None,
     grid: Path | str | None = None,
     mesh: bool = False,
+    roi: str = "",
     accept_rejected: bool = False,
     check: bool = True,
     progress: Progress = ignore_progress,
@@ -116,6 +122,8 @@ def reconstruct(
             outline.
         grid: Also write the whole organised cloud, (h, w, 3) float32 mm, NaN where invalid, as .npy.
         mesh: Put the triangles between neighbouring pixels into the PLY.
+        roi: Region of interest, outside of which points are ignored: x0,x1,y0,y1,z0,z1 in mm in the camera's frame
+            (x right, y down, z away), a TOML file, or off; by default the session's.
         accept_rejected: Use the calibration although its verdict rejects it.
 
     ``check``: also compare the frames with each other, and warn of those that do not fit.
@@ -138,7 +146,10 @@ def reconstruct(
             )
             for n, m in chosen.items()
         }
-        cloud = clouds[name]
+        cloud = uncut = clouds[name]
+        box = None if is_pose else resolve_region(store, roi)
+        cloud = cloud if is_pose else restrict_cloud(store, capture, cloud, box)
+        restrictions = () if is_pose else restriction_notes(store, [capture], box)
         region = segment_board(store, shot, texture, warn) if is_pose else None
         board = None
         if region is not None:
@@ -154,7 +165,7 @@ def reconstruct(
         progress(0.8, "writing")
         ply.parent.mkdir(parents=True, exist_ok=True)
         faces = triangulate_points(cloud.points, mask) if mesh else None
-        notes = (f"scan {capture}, frame: {frame_of(store, name)}", f"calibration {name}")
+        notes = (f"scan {capture}, frame: {frame_of(store, name)}", f"calibration {name}", *restrictions)
         write_ply(
             ply,
             choose_pixels(cloud.points, mask),
@@ -170,7 +181,10 @@ def reconstruct(
         masked = masked_share(fitted, phases[cloud.axis], region) if isinstance(fitted, SplinedModel) else None
         raised = fitted.residuals_over_noise(cloud.axis) if isinstance(fitted, SplinedModel) else 1.0
         progress(1.0, "reconstructed")
-    return Reconstruction(cloud, phases, ply, int(np.count_nonzero(mask)), board, scale, masked, frame, raised)
+    count = int(np.count_nonzero(mask))
+    return Reconstruction(
+        cloud, phases, ply, count, board, scale, masked, frame, raised, None if cloud is uncut else uncut, restrictions
+    )
 
 
 def triangulate_points(points: np.ndarray, mask: np.ndarray) -> np.ndarray:

@@ -4,6 +4,8 @@ An entry that is damaged concerns only those that need it; the others are read, 
 """
 
 import contextlib
+import hashlib
+import json
 import os
 import threading
 from collections.abc import Callable
@@ -18,6 +20,19 @@ from slviewer.session.atomic import replace_json
 from slviewer.session.reading import read_json
 
 _Exposure = Annotated[float, msgspec.Meta(gt=0, lt=1e9)]
+_Millimetres = Annotated[float, msgspec.Meta(gt=-1e6, lt=1e6)]
+_Triple = tuple[_Millimetres, _Millimetres, _Millimetres]
+
+
+class _Region(TypedDict):
+    """The region of interest, and whether it is in effect."""
+
+    centre_mm: _Triple
+    size_mm: _Triple
+    rotation_deg: _Triple
+    on: bool
+
+
 _Decisions = TypedDict(
     "_Decisions",
     {
@@ -34,9 +49,12 @@ _Decisions = TypedDict(
         "rig": dict[str, Any] | None,
         "use_anyway": str | None,
         "align_scans": bool | None,
+        "region": _Region | None,
     },
     total=False,
 )
+REGION_INPUT = "decision/region"
+"""The region of interest as an input of results."""
 _REMEDY = "restore it from a copy, or move this file away, which forgets exclusions, names and settings"
 
 
@@ -78,6 +96,13 @@ class Decisions:
             return list(_read_all(self.folder / "decisions.json")[1].values())
         except DamagedError as error:
             return [str(error)]
+
+    def decision_hashes(self, name: str) -> list[str]:
+        """Hash of the decision that results name as their input ``decision/...``; none where it is not in effect."""
+        region = self.decision("region") if name == REGION_INPUT else None
+        if not region or not region["on"]:
+            return []
+        return [hashlib.blake2b(json.dumps(region).encode(), digest_size=20).hexdigest()]
 
     def _decide(self, what: str, make: Callable[[], Any]) -> None:
         """Replace a decision by what ``make`` returns, which nobody else changes meanwhile; the others stay."""

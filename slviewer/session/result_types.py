@@ -7,7 +7,7 @@ have their shapes checked by the classes that are made of them.
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Required, TypedDict
+from typing import Annotated, Any, Literal, Required, TypedDict
 
 import msgspec
 
@@ -132,6 +132,27 @@ class _Cloud(ResultMeta, total=False):
     scale: str
 
 
+class _Edit(TypedDict):
+    """An edit of a scan: its pixels are the array of its number, or it has a plane."""
+
+    kind: Literal["pixels", "plane"]
+    what: str
+    points: _Count
+    normal: _Triple | None
+    offset_mm: float | None
+    margin_mm: float | None
+
+
+class _Edits(ResultMeta, total=False):
+    """`edits/*`."""
+
+    capture: str
+    size: Size
+    applied: _Count
+    edits: list[_Edit]
+    content: str
+
+
 class _VerifiedModel(TypedDict, total=False):
     """The figures of one model in a verification."""
 
@@ -206,6 +227,7 @@ class _Merge(ResultMeta, total=False):
     refused: list[_Refused]
     left_out: dict[str, dict[str, _Count]]
     shared: float | None
+    restrictions: list[str]
 
 
 class _Placement(ResultMeta, total=False):
@@ -283,6 +305,7 @@ _TYPES: dict[str, Any] = {
     "evidence": _Evidence,
     "trust": _FrameCheck,
     "clouds": _Cloud,
+    "edits": _Edits,
     "verify": _Verified,
     "merge": _Merge,
     "placement": _Placement,

@@ -370,7 +370,7 @@ class Session(Decisions):
     def state_of(self, name: str) -> State:
         """Return `fresh`, `stale` or `absent`; fresh if every input of the result is fresh and has the hash it had.
 
-        A damaged input makes it stale, as do inputs in a circle; DamagedError where its own description is damaged.
+        An absent input has the hash "", a damaged one makes it stale, as do inputs in a circle. Raises DamagedError.
         """
         return self._state_of(name, {}, 0)
 
@@ -382,7 +382,7 @@ class Session(Decisions):
         inputs, known[name] = read_meta(folder).get("inputs", {}), "stale"  # while it is examined, or if that fails
         with contextlib.suppress(DamagedError, InputError):
             for other, used in inputs.items():
-                changed = used not in self._hashes(other) or depth == _MAX_INPUTS_CHAIN
+                changed = used not in (self._hashes(other) or [""]) or depth == _MAX_INPUTS_CHAIN
                 if changed or (other != name and self._state_of(other, known, depth + 1) == "stale"):
                     return "stale"
             known[name] = "fresh"
@@ -490,10 +490,10 @@ class Session(Decisions):
         return trash_place(self.folder / "trash", "-".join(parts[1:]) or parts[0])
 
     def _hashes(self, name: str) -> list[str]:
-        """Content hashes of the capture and of the result of that name, where there are any."""
+        """Content hashes of the capture, decision and result of that name; of a result its ``content`` where stated."""
         is_capture = "/" not in name and self._has_description(name)
-        content_hashes = [self.load_capture(name).hash] if is_capture else []
-        folder = self._result_folder(name)
-        if (folder / "meta.json").is_file():
-            content_hashes.append(str(read_meta(folder).get("hash")))
+        content_hashes = [self.load_capture(name).hash] if is_capture else self.decision_hashes(name)
+        if self.has_result(name):
+            meta = read_meta(self._result_folder(name))
+            content_hashes.append(str(meta.get("content", meta.get("hash"))))
         return content_hashes

@@ -12,8 +12,6 @@ import numpy as np
 from slviewer.calibration.diagnosis.verdict import Verdict
 from slviewer.calibration.next_pose import outline_px
 from slviewer.calibration.observe import Observation
-from slviewer.calibration.pixelwise import PixelwiseModel
-from slviewer.calibration.splined.model import SplinedModel
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import DamagedError, InputError, SessionError
 from slviewer.fringe.presets import PRESETS
@@ -23,7 +21,6 @@ from slviewer.pipeline.capture import DEFAULT_PATTERNS
 from slviewer.pipeline.models import (
     accepts_rejected,
     available_models,
-    load_model,
     load_stereo_if_complete,
     load_validation,
     preferred_model,
@@ -38,8 +35,10 @@ from slviewer.session.capture import Capture
 from slviewer.session.measurements import FOLDER as MEASUREMENTS
 from slviewer.session.measurements import NAMES, Measurement, measurement_from_meta
 from slviewer.session.names import natural_key
+from slviewer.session.scan_edits import list_edits, load_region, restriction_inputs
 from slviewer.session.store import Session
 from slviewer.target.board import Board
+from slviewer.wizard.calibration_views import load_fit_rms, load_splined
 from slviewer.wizard.export_files import list_exports
 from slviewer.wizard.notices import describe_error
 from slviewer.wizard.planner import Planner
@@ -53,7 +52,6 @@ from slviewer.wizard.snapshot import (
     RigView,
     ScanView,
     SessionView,
-    SplinedView,
 )
 from slviewer.wizard.surfaces import list_nominals
 from slviewer.wizard.tasks import missing_for_splined
@@ -165,7 +163,9 @@ class SessionReader:
         captures = {capture.name: capture for capture in sound}
         calibration = self._attempt("the calibration", lambda: self._read_calibration(captures), None)
         models = calibration.models if calibration else ()
-        hashes = {name: capture.hash for name, capture in captures.items()}
+        scans = [capture.name for capture in sound if capture.role == "scan"]
+        cuts = self._attempt("edits and region", lambda: restriction_inputs(session, scans), dict[str, str]())
+        hashes = cuts | {name: capture.hash for name, capture in captures.items()}
         for name in (f"calibration/{model}" for model in models):
             meta = self._load_meta(name)
             if not _has_changed(meta["inputs"], hashes):
@@ -200,6 +200,8 @@ class SessionReader:
             exposures_ms=self.exposures_ms(),
             is_linear=self.levels() is not None,
             aligns_scans=bool(session.valid_decision("align_scans")),
+            region=self._attempt("the region", lambda: load_region(session, even_if_off=True), None),
+            region_is_on=bool((session.valid_decision("region") or {}).get("on")),
             deleted_poses=tuple(session.deleted_captures("calibration")),
             deleted_scans=tuple(session.deleted_captures("scan")),
             faults=tuple(dict.fromkeys(self._faults)),
@@ -331,9 +333,9 @@ class SessionReader:
         fit_rms: Mapping[str, Mapping[str, float]] | None = {}
         splined = None
         if "pixelwise" in models:
-            fit_rms = self._get_cached(("pixelwise", hashes["pixelwise"]), lambda: _load_fit_rms(session))
+            fit_rms = self._get_cached(("pixelwise", hashes["pixelwise"]), lambda: load_fit_rms(session))
         if "splined" in models:
-            splined = self._get_cached(("splined", hashes["splined"]), lambda: _load_splined(session))
+            splined = self._get_cached(("splined", hashes["splined"]), lambda: load_splined(session))
         foreign = ""
         if fit_rms is None or ("splined" in models and splined is None):
             foreign = "it was saved by another version of slviewer: calibrate again"
@@ -385,6 +387,9 @@ class SessionReader:
         find = partial(self._find_meta, f"clouds/{capture.name}")
         meta: dict[str, Any] = self._attempt(f"the cloud of {capture.name}", find, {})
         depths, read = meta.get("depth_mm"), partial(self._read_placement, capture.name, inputs)
+        edits, undone = self._attempt(
+            f"the edits of {capture.name}", partial(list_edits, self.session, capture.name), (tuple[str, ...](), 0)
+        )
         return ScanView(
             name=capture.name,
             label=str(inputs.labels.get(capture.name, capture.name)),
@@ -400,6 +405,8 @@ class SessionReader:
             thumbnail=self._thumbnails.get(capture.hash, b""),
             placement=self._attempt(f"the place of {capture.name}", read, None),
             turn_step=capture.turn_step,
+            edits=edits,
+            undone_edits=undone,
         )
 
     def _read_placement(self, name: str, inputs: _Inputs) -> align.Placement | None:
@@ -477,24 +484,3 @@ def _is_verdict_of(verdict: Verdict | None, meta: Mapping[str, Any]) -> bool:
     """Whether the verdict is the one saved with a calibration's `meta`."""
     saved = meta.get("verdict")
     return verdict is not None and saved is not None and from_plain(saved, Verdict) == verdict
-
-
-def _load_fit_rms(session: Session) -> dict[str, Mapping[str, float]] | None:
-    """Load {axis: {coefficient: median mm}} of the pixel-wise model; None where another version saved it."""
-    try:
-        model = load_model(session, "pixelwise")
-    except SessionError:
-        return None
-    assert isinstance(model, PixelwiseModel)
-    return {axis: model.median_rms_mm(axis) for axis in model.axes}
-
-
-def _load_splined(session: Session) -> SplinedView | None:
-    """Load the summary of the splined model; None where another version saved it."""
-    try:
-        model = load_model(session, "splined")
-    except SessionError:
-        return None
-    assert isinstance(model, SplinedModel)
-    weights = {name: (fit.camera_trust, fit.projector_trust) for name, fit in model.bundle.fits.items()}
-    return SplinedView(model.summary(), weights, model.bundle.half_turned_poses)

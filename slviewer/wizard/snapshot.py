@@ -20,6 +20,7 @@ from slviewer.pipeline.suggest_exposure import ExposureSuggestion
 from slviewer.report.data import SpacingRow, VerificationView
 from slviewer.session.capture import TurnStep
 from slviewer.session.measurements import Measurement
+from slviewer.surface.region_of_interest import RegionOfInterest
 from slviewer.wizard.pose_plan import PlanInput, PosePlan
 
 Level = Literal["info", "good", "warning", "error"]
@@ -179,6 +180,8 @@ class ScanView:
     scale: str = ""  # the correction of scale in the cloud, in words
     placement: Placement | None = None  # among the scans that are aligned as they come; None: it was not tried
     turn_step: TurnStep | None = None  # of a turn on a turntable
+    edits: tuple[str, ...] = ()  # that are in effect, in words
+    undone_edits: int = 0  # which can be redone
 
 
 @dataclass(frozen=True)
@@ -310,6 +313,8 @@ class SessionView:
     is_linear: bool = False  # whether patterns are corrected by the measured table of grey levels
     exposures_ms: tuple[float, ...] = ()  # of every capture; empty: a single one, the camera's
     aligns_scans: bool = False  # each new scan to those before it
+    region: RegionOfInterest | None = None  # in effect where `region_is_on`
+    region_is_on: bool = False
     faults: tuple[str, ...] = ()  # what is damaged, or no capture, and missing here, with the remedy
 
     @property

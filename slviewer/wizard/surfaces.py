@@ -9,7 +9,9 @@ from slviewer.errors import InputError
 from slviewer.pipeline.measured_surface import MERGED, MeasuredSurface, Place, load_merged_surface, surface_from_cloud
 from slviewer.pipeline.models import load_model
 from slviewer.pipeline.scale import scale_factor
+from slviewer.pipeline.scan_edits import restrict_cloud
 from slviewer.reconstruction.cloud import Cloud
+from slviewer.session.scan_edits import load_region, restriction_inputs
 from slviewer.session.store import Session
 from slviewer.wizard.result_views import nearest
 
@@ -22,7 +24,7 @@ class Surfaces:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._key: tuple[str, str, str] | None = None
+        self._key: tuple[str, ...] | None = None
         self._cached: MeasuredSurface | None = None
 
     def load(self, store: Session, name: str) -> MeasuredSurface:
@@ -38,7 +40,8 @@ class Surfaces:
         scaled = all(scale_factor(store, model) == factor for model, factor in meta.get("scales", {}).items())
         if store.state_of(result) == "stale" or not scaled:
             raise InputError(f"the inputs of {name} have changed: {again}, then measure")
-        key = (str(store.folder), result, str(meta["hash"]))
+        cut = "" if result == name else str(restriction_inputs(store, [name]))
+        key = (str(store.folder), result, str(meta["hash"]), cut)
         with self._lock:
             if self._key != key or self._cached is None:
                 self._cached = load_merged_surface(store, name) if result == name else _load_scan(store, name)
@@ -52,6 +55,7 @@ def _load_scan(store: Session, name: str) -> MeasuredSurface:
     systematic = arrays.get("sigma_calibration")
     points, sigma, texture = (arrays[each] for each in ("points", "sigma_z", "texture"))
     cloud = Cloud(points, meta["axis"], meta["model"], sigma, texture, systematic, arrays.get("sigma_edges"))
+    cloud = restrict_cloud(store, name, cloud, load_region(store))
     return surface_from_cloud(store, name, cloud, load_model(store, meta["model"]))
 
 

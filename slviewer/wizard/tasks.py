@@ -93,7 +93,7 @@ def reconstruct_capture(session: Session, name: str, model: str | None, report: 
         made = reconstruct(
             session, name, model=model, out=ply, accept_rejected=accepts, check=False, progress=progress, warn=warn
         )
-        cloud, phase = made.cloud, made.phases[made.cloud.axis]
+        cloud, phase = made.uncut or made.cloud, made.phases[made.cloud.axis]  # edits apply to what is read
         z = cloud.points[..., 2][cloud.mask]
         near, far = np.percentile(z, [1, 99])
         calibrations = dict.fromkeys(("calibration/stereo", f"calibration/{model}"))

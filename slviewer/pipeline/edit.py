@@ -1,0 +1,182 @@
+"""Setting the region of interest of a session, and deleting points of a scan so that they can be brought back."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from slviewer.errors import InputError, UsageError
+from slviewer.pipeline.export_shapes import scan_cloud
+from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
+from slviewer.pipeline.models import ModelName, check_accepted
+from slviewer.pipeline.open_session import SessionLike, opened
+from slviewer.pipeline.scan_edits import OFF, parse_region
+from slviewer.session.scan_edits import list_edits, load_edits, load_region, save_edits, save_region
+from slviewer.session.store import Session
+from slviewer.surface.point_edits import make_edit
+from slviewer.surface.region_of_interest import RegionOfInterest
+from slviewer.surface.selection import SupportPlane, detect_support, select_connected, select_polygon
+
+
+@dataclass(frozen=True)
+class ScanEdits:
+    """The edits of a scan that are in effect, in words, how many were undone, and how many points remain, where that
+    was computed."""
+
+    scan: str
+    edits: tuple[str, ...]
+    undone: int
+    remaining: int | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        """The contract of ``edit --json``."""
+        return {"scan": self.scan, "edits": list(self.edits), "undone": self.undone, "remaining": self.remaining}
+
+    def text(self) -> str:
+        """List the edits, numbered in their order."""
+        lines = [f"{i}. {words}" for i, words in enumerate(self.edits, 1)] or [f"{self.scan} has no edits in effect"]
+        if self.remaining is not None:
+            lines.append(f"{self.remaining} points remain")
+        if self.undone:
+            lines.append(f"{self.undone} undone: bring them back with --redo {self.undone}")
+        return "\n".join(lines)
+
+
+def edit_scan(
+    session: SessionLike,
+    scan: str,
+    *,
+    polygon: Sequence[float] = (),
+    part: Sequence[int] = (),
+    support: bool = False,
+    margin: float | None = None,
+    invert: bool = False,
+    undo: int = 0,
+    redo: int = 0,
+    model: ModelName | None = None,
+    accept_rejected: bool = False,
+    progress: Progress = ignore_progress,
+    warn: Warn = ignore_warnings,
+) -> ScanEdits:
+    """Delete points of a scan, undo and redo that, or list what was deleted; the scan itself stays as it was captured.
+
+    What is deleted is not used by reconstruct, merge, mesh, measure and export, with any later calibration too.
+
+    Args:
+        session: Session folder.
+        scan: Name of the capture.
+        polygon: Delete what the camera sees within this polygon: u v of three or more pixels (column, row).
+        part: Delete the connected part of the surface that this pixel, u v, belongs to.
+        support: Delete the plane that the object stands on, and all below it.
+        margin: Millimetres above that plane that belong to it; by default three times the scatter of its points.
+        invert: Delete everything else instead.
+        undo: Undo so many edits, the last first.
+        redo: Bring so many undone edits back.
+        model: Which calibration to select points by; by default the best one available.
+        accept_rejected: Use the calibration although its verdict rejects it.
+    """
+    chosen = sum((bool(polygon), bool(part), support))
+    if chosen + bool(undo) + bool(redo) > 1:
+        raise UsageError("do one thing at a time: --polygon, --part, --support, --undo or --redo")
+    if (invert and not chosen) or (margin is not None and not support):
+        raise UsageError("--invert needs --polygon, --part or --support, and --margin needs --support")
+    if not chosen and not undo and not redo:
+        with opened(session) as store:
+            store.load_capture(scan)
+            return ScanEdits(scan, *list_edits(store, scan))
+    with opened(session, write=True) as store:
+        if not chosen:
+            change_history(store, scan, undo=undo, redo=redo)
+            return ScanEdits(scan, *list_edits(store, scan))
+        check_accepted(store, accept_rejected)
+        cloud = scan_cloud(store, scan, model, progress, warn, accept_rejected)
+        plane = None
+        if support:
+            plane = detect_support(cloud.points, float(np.nanmedian(cloud.sigma_z)), margin)
+            selected, what = plane.select_below(cloud.points), "support and below"
+        elif part:
+            if len(part) != 2:
+                raise UsageError(f"--part has {len(part)} numbers: give u v of one pixel, such as --part 180 150")
+            selected, what = select_connected(cloud.points, (part[0], part[1])), "connected part"
+        else:
+            if len(polygon) % 2 or len(polygon) < 6:
+                raise UsageError(f"--polygon has {len(polygon)} numbers: give u v of three or more pixels")
+            selected, what = select_polygon(cloud.sigma_z.shape, np.reshape(polygon, (-1, 2))), "polygon"
+        if invert:
+            selected, what, plane = ~selected, f"all but {what}", None
+        delete_points(store, scan, cloud.points, selected, what, plane)
+        remaining = int(np.count_nonzero(cloud.mask & ~selected))
+        progress(1.0, "edited")
+        return ScanEdits(scan, *list_edits(store, scan), remaining)
+
+
+def delete_points(
+    store: Session, scan: str, points: np.ndarray, selected: np.ndarray, what: str, plane: SupportPlane | None = None
+) -> int:
+    """Delete the ``selected`` (h, w) of the points (h, w, 3) mm that a scan shows; returns how many. ``what``: how they
+    were selected; ``plane``: what they all lie below of, where they do.
+
+    InputError where nothing is selected, or nothing would remain.
+    """
+    edit = make_edit(points, selected, what, plane)
+    measured = int(np.count_nonzero(np.isfinite(points).all(axis=-1)))
+    if edit.points == measured:
+        raise InputError(f"all {measured} points of {scan} are selected: select fewer, or delete the scan")
+    save_edits(store, scan, load_edits(store, scan).add(edit))
+    return edit.points
+
+
+def change_history(store: Session, scan: str, *, undo: int = 0, redo: int = 0) -> None:
+    """Undo or redo so many edits of a scan. InputError where there are fewer."""
+    history = load_edits(store, scan)
+    save_edits(store, scan, history.undo(undo) if undo else history.redo(redo))
+
+
+def set_region(
+    session: SessionLike,
+    *,
+    roi: str = "",
+    around: str = "",
+    model: ModelName | None = None,
+    accept_rejected: bool = False,
+    progress: Progress = ignore_progress,
+    warn: Warn = ignore_warnings,
+) -> str:
+    """Set the region of interest of a session, or show it: points of scans outside of it are ignored.
+
+    It holds for reconstruct, merge, mesh, measure and export, unless their own --roi states another one.
+
+    Args:
+        session: Session folder.
+        roi: The box: x0,x1,y0,y1,z0,z1 in mm in the camera's frame (x right, y down, z away), or a TOML file with
+            centre_mm, size_mm and rotation_deg; off switches it off, on switches the last one on.
+        around: A scan: the box around all of its points.
+        model: Which calibration to use for that scan; by default the best one available.
+        accept_rejected: Use the calibration although its verdict rejects it.
+    """
+    if roi and around:
+        raise UsageError("state the region with --roi, or take it from a scan with --around: one of both")
+    if not roi and not around:
+        with opened(session) as store:
+            return describe_region(store)
+    with opened(session, write=True) as store:
+        if around:
+            check_accepted(store, accept_rejected)
+            cloud = scan_cloud(store, around, model, progress, warn, accept_rejected, OFF)
+            save_region(store, RegionOfInterest.around(cloud.points))
+        else:
+            known = load_region(store, even_if_off=True)
+            if roi == "on" and known is None:
+                raise InputError("the session has no region of interest yet: state its box, or use --around SCAN")
+            save_region(store, known if roi in (OFF, "on") else parse_region(roi), roi != OFF)
+        return describe_region(store)
+
+
+def describe_region(store: Session) -> str:
+    """Describe the region of interest of a session, and whether it is in effect."""
+    region = load_region(store, even_if_off=True)
+    if region is None:
+        return "the session has no region of interest: all points are used"
+    state = "on" if load_region(store) is not None else "off: all points are used"
+    return f"region of interest: {region.text()} ({state})"

@@ -1,0 +1,201 @@
+"""Region of interest and edits of scans, from the commands to the files that they change."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from slviewer.cli import main
+from slviewer.devices.simulated import simulated_rig
+from slviewer.devices.world import SimulatedWorld
+from slviewer.errors import DamagedError, InputError, UsageError
+from slviewer.pipeline.capture import capture
+from slviewer.pipeline.edit import edit_scan, set_region
+from slviewer.pipeline.export import export
+from slviewer.pipeline.measure import measure
+from slviewer.pipeline.measured_surface import load_surface
+from slviewer.pipeline.merge import merge
+from slviewer.pipeline.mesh import mesh
+from slviewer.pipeline.reconstruct import reconstruct
+from slviewer.pipeline.rig_choice import RigSetup
+from slviewer.pipeline.scan_edits import parse_region
+from slviewer.session.ply import read_ply
+from slviewer.session.scan_edits import load_edits, load_region
+from slviewer.session.store import Session
+from slviewer.simulation.rig import letter
+from slviewer.surface.point_edits import EditHistory
+from slviewer.validation.bench_live import true_calibration
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory) -> Path:
+    """A session whose calibration is the truth, with two scans of the simulated object."""
+    folder = tmp_path_factory.mktemp("editing") / "session"
+    rig = letter(0.25)
+    true_calibration(folder, rig)
+    world = SimulatedWorld(rig)
+    for name, turn in (("one", 0.0), ("two", 6.0)):
+        world.place("object")
+        world.turn_table(turn)
+        bench = RigSetup(simulated_rig(world))
+        capture(folder, name, {}, role="scan", patterns="gray", set_up=lambda *_, bench=bench: bench)
+    return folder
+
+
+@pytest.fixture
+def session(made: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(made, tmp_path / "session"))
+
+
+@pytest.fixture
+def cloud(session: Path, tmp_path: Path) -> np.ndarray:
+    """The whole cloud of `one`, (h, w, 3) mm."""
+    return reconstruct(session, "one", out=tmp_path / "whole.ply").cloud.points
+
+
+def middle_half(points: np.ndarray) -> str:
+    """Six numbers of the box around the middle half of the points along x."""
+    flat = points[np.isfinite(points[..., 2])]
+    low, high = flat.min(axis=0) - 1, flat.max(axis=0) + 1
+    low[0], high[0] = np.percentile(flat[:, 0], [25, 75])
+    return ",".join(f"{value:.3f}" for pair in zip(low, high, strict=True) for value in pair)
+
+
+def left_half(points: np.ndarray) -> list[float]:
+    """The polygon, u v of its corners, of the camera's columns up to the middle one of what was measured."""
+    u = float(np.median(np.argwhere(np.isfinite(points[..., 2]))[:, 1]))
+    return [-1, -1, u, -1, u, len(points), -1, len(points)]
+
+
+def count(points: np.ndarray) -> int:
+    return int(np.isfinite(points).all(axis=-1).sum())
+
+
+def test_every_command_uses_the_region_of_the_session(session: Path, cloud: np.ndarray, tmp_path: Path) -> None:
+    total = count(cloud)
+    text = set_region(session, roi=middle_half(cloud))
+    assert "(on)" in text
+    with Session.open(session) as store:
+        region = load_region(store)
+    assert region is not None
+    wanted = int(region.contains(cloud).sum())
+    assert 0.4 * total < wanted < 0.6 * total
+    made = reconstruct(session, "one", out=tmp_path / "cut.ply", grid=tmp_path / "cut.npy")
+    assert made.points == wanted == len(read_ply(tmp_path / "cut.ply").points)
+    assert count(np.load(tmp_path / "cut.npy")) == wanted
+    assert region.text() in made.text()
+    assert len(read_ply(export(session, "cloud", "one").path).points) == wanted
+    assert count(load_surface(session, "one").points) == wanted
+    vertices = read_ply(mesh(session, ["one"], tmp_path / "cut_mesh.ply").out).points
+    assert region.contains(np.asarray(vertices, float)).mean() > 0.999
+    merged = merge(session, ["two"], "one", tmp_path / "merged.ply", start="identity")
+    assert max(count(each.points) for each in merged.clouds.values()) < 0.65 * total
+    assert reconstruct(session, "one", out=tmp_path / "all.ply", roi="off").points == total
+    assert "off" in set_region(session, roi="off")
+    assert reconstruct(session, "one", out=tmp_path / "all.ply").points == total
+    assert reconstruct(session, "one", out=tmp_path / "all.ply", roi=middle_half(cloud)).points == wanted
+    set_region(session, roi="on")
+    assert reconstruct(session, "one", out=tmp_path / "all.ply").points == wanted
+    assert "(on)" in set_region(session, around="one")
+    assert reconstruct(session, "one", out=tmp_path / "all.ply").points > 0.995 * total
+
+
+def test_a_region_of_a_file_may_be_turned(session: Path, cloud: np.ndarray, tmp_path: Path) -> None:
+    centre = np.nanmedian(cloud, axis=(0, 1))
+    file = tmp_path / "box.toml"
+    file.write_text(f"centre_mm = {centre.tolist()}\nsize_mm = [60.0, 30.0, 400.0]\nrotation_deg = [0.0, 0.0, 45.0]\n")
+    region = parse_region(str(file))
+    made = reconstruct(session, "one", out=tmp_path / "cut.ply", roi=str(file))
+    assert made.points == int(region.contains(cloud).sum()) > 100
+    file.write_text("centre_mm = [1.0, 2.0]\n")
+    with pytest.raises(InputError, match="centre_mm"):
+        parse_region(str(file))
+
+
+def test_a_region_beside_the_scan_is_refused_with_numbers(session: Path, tmp_path: Path, capfd) -> None:
+    for run in (
+        lambda: reconstruct(session, "one", roi="0,1,0,1,10,20"),
+        lambda: merge(session, ["two"], "one", tmp_path / "m.ply", start="identity", roi="0,1,0,1,10,20"),
+        lambda: measure(session, "one", "plane", ball=(0, 0, 500, 20), roi="0,1,0,1,10,20"),
+    ):
+        with pytest.raises(InputError, match=r"none of its \d{3,} points.*z \d+ to \d+ mm"):
+            run()
+    for wrong in ("1,2,3", "0,1,5,4,1,2", "nan,1,0,1,0,1", str(tmp_path / "none.toml")):
+        with pytest.raises(UsageError):
+            reconstruct(session, "one", roi=wrong)
+    assert main(["reconstruct", str(session), "one", "--roi=-1,1,-1,1,10,20"]) == 1
+    assert "none of its" in capfd.readouterr().err
+    assert main(["region", str(session), "--roi=-500,500,-500,500,10,2000"]) == 0
+    assert "1000.0 x 1000.0 x 1990.0 mm" in capfd.readouterr().out
+
+
+def test_edits_are_stored_undone_and_redone(session: Path, cloud: np.ndarray, tmp_path: Path, capfd) -> None:
+    total = count(cloud)
+    h, w = cloud.shape[:2]
+    half = left_half(cloud)
+    edited = edit_scan(session, "one", polygon=half)
+    left = count(cloud[:, : int(half[2]) + 1])
+    assert 0.4 * total < left < 0.6 * total
+    assert edited.remaining == total - left
+    assert reconstruct(session, "one", out=tmp_path / "cut.ply").points == total - left
+    assert len(edited.edits) == 1 and str(left) in edited.edits[0]
+    rows, columns = np.nonzero(np.isfinite(cloud[..., 2]) & (np.arange(w) > half[2]))
+    part = (int(columns[500]), int(rows[500]))
+    with pytest.raises(InputError, match="no point"):  # the object is one part
+        edit_scan(session, "one", part=part, invert=True)
+    edit_scan(session, "one", polygon=[0, -1, w, -1, w, rows[500], 0, rows[500]], invert=True)
+    assert len(load(session).active) == 2
+    assert edit_scan(session, "one", undo=2).undone == 2
+    assert reconstruct(session, "one", out=tmp_path / "cut.ply").points == total
+    assert edit_scan(session, "one", redo=1).undone == 1
+    assert reconstruct(session, "one", out=tmp_path / "cut.ply").points == total - left
+    assert main(["edit", str(session), "one"]) == 0
+    assert "1. polygon" in capfd.readouterr().out
+    with pytest.raises(InputError):
+        edit_scan(session, "one", undo=2)
+    with pytest.raises(InputError, match="all"):
+        edit_scan(session, "one", polygon=[0, 0, w, 0, w, h, 0, h])
+    for wrong in ({"polygon": [1, 2]}, {"part": [1]}, {"undo": 1, "redo": 1}, {"invert": True}, {"margin": 1.0}):
+        with pytest.raises(UsageError):
+            edit_scan(session, "one", **wrong)
+
+
+def load(session: Path) -> EditHistory:
+    with Session.open(session) as store:
+        return load_edits(store, "one")
+
+
+def test_results_are_stale_once_edits_or_region_change(session: Path, cloud: np.ndarray) -> None:
+    merge(session, ["two"], "one", start="identity")
+    u, v = (int(i) for i in np.argwhere(np.isfinite(cloud[..., 2]))[2000][::-1])
+    measurement = measure(session, "one", "point", at=(u, v))
+    results = ("merge/1", f"measurements/{measurement.id}")
+
+    def states() -> list[str]:
+        with Session.open(session) as store:
+            return [store.state_of(result) for result in results]
+
+    assert states() == ["fresh", "fresh"]
+    edit_scan(session, "one", polygon=left_half(cloud))
+    assert states() == ["stale", "stale"]
+    edit_scan(session, "one", undo=1)
+    assert states() == ["fresh", "fresh"]
+    set_region(session, roi="-500,500,-500,500,10,2000")
+    assert states() == ["stale", "stale"]
+    set_region(session, roi="off")
+    assert states() == ["fresh", "fresh"]
+
+
+def test_edits_of_another_capture_or_damaged_ones_are_not_applied(session: Path, cloud: np.ndarray) -> None:
+    edit_scan(session, "one", polygon=left_half(cloud))
+    with Session.open(session, write=True) as store:
+        one, other = store.load_capture("one"), store.load_capture("two")
+        frames = other.stack(list(range(len(other.sequence.frames))))
+        store.save_capture("one", "scan", one.sequence, frames, source="again", force=True)
+        assert not load_edits(store, "one").active
+    edit_scan(session, "two", polygon=left_half(cloud))
+    file = next((session / "results/edits/two/arrays").glob("*.npy"))
+    file.write_bytes(file.read_bytes()[:-3])
+    with pytest.raises(DamagedError):
+        reconstruct(session, "two")
