@@ -57,7 +57,8 @@ class SurfaceView:
         scans = [scan for scan in sort_scans(session.scans) if scan.cloud == "fresh"] if session else []
         offered = [(scan.name, display_name(scan.name, scan.label)) for scan in scans]
         folder = session.folder if session else None
-        self._versions = {s.name: (folder, s.model, s.points, s.noise_mm, s.scale) for s in scans}
+        cut = session.restriction if session else lambda _: (None, ())
+        self._versions = {s.name: (folder, s.model, s.points, s.noise_mm, s.scale, *cut(s.name)) for s in scans}
         merge = session.merge if session else None
         if merge is not None and not merge.stale:
             name = f"{MERGED}{merge.name}"

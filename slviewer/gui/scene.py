@@ -12,6 +12,8 @@ import viser
 import viser.transforms as tf
 from numpy.typing import NDArray
 
+from slviewer.surface.selection import ViewCamera
+
 Colour = tuple[int, int, int]
 
 CAMERA: Colour = (40, 120, 200)
@@ -32,6 +34,7 @@ class ViewerScene:
         self._layers: dict[str, Any] = {}
         self._nodes: dict[tuple[str, str], list[Any]] = {}
         self._pick: Callable[[Any], Any] | None = None
+        self._rectangle: Callable[[Any], Any] | None = None
         api.set_up_direction("-y")
         api.add_grid(
             "/floor",
@@ -242,6 +245,43 @@ class ViewerScene:
         )
         self._store_nodes(layer, name, nodes)
 
+    def lines(self, layer: str, name: str, segments: np.ndarray, colour: Colour, width_px: float = 3.0) -> None:
+        """Draw segments (n, 2, 3) mm."""
+        handle = self._api.add_line_segments(
+            self._make_path(layer, name),
+            np.asarray(segments, np.float32),
+            colour,
+            thickness=width_px,
+            thickness_units="screen",
+        )
+        self._store_nodes(layer, name, [handle])
+
+    def on_view_click(self, do: Callable[[ViewCamera, np.ndarray, np.ndarray], None] | None) -> None:
+        """Call `do(view, at, direction)` for each click in place of `on_pick`: the browser's view, the place in it,
+        (2,) from 0 at its upper left to 1, and the ray (3,) through it; None: stop."""
+        self.on_pick(None)
+        if do is not None:
+
+            def click(event: Any) -> None:
+                """Call `do` with the place and view of a click."""
+                do(read_view(event.client), np.array(event.screen_pos), np.array(event.ray_direction))
+
+            self._pick = self._api.on_click()(click)
+
+    def on_rectangle(self, do: Callable[[ViewCamera, np.ndarray, np.ndarray], None] | None) -> None:
+        """Call `do(view, low, high)` for each rectangle that is dragged: the browser's view, and two corners, (2,) from
+        0 at its upper left to 1; dragging does not turn the view then. None: stop."""
+        if self._rectangle is not None:
+            self._api.remove_rect_select_callback(self._rectangle)
+            self._rectangle = None
+        if do is not None:
+
+            def select(event: Any) -> None:
+                """Call `do` with the corners of a rectangle."""
+                do(read_view(event.client), np.array(event.screen_min), np.array(event.screen_max))
+
+            self._rectangle = self._api.on_rect_select()(select)
+
     def on_pick(self, do: Callable[[np.ndarray, np.ndarray], None] | None) -> None:
         """Call `do(origin, direction)`, (3,) each in the camera's frame, for each click into the scene; None: stop."""
         if self._pick is not None:
@@ -270,6 +310,13 @@ class ViewerScene:
     def _store_nodes(self, layer: str, name: str, nodes: list[Any]) -> None:
         """Store the nodes of an object, its root first."""
         self._nodes[layer, name] = nodes
+
+
+def read_view(client: viser.ClientHandle) -> ViewCamera:
+    """Return the view of a browser."""
+    camera = client.camera
+    rotation = tf.SO3(np.asarray(camera.wxyz, float)).as_matrix()
+    return ViewCamera(np.asarray(camera.position, float), rotation, float(camera.fov), float(camera.aspect))
 
 
 def _split_pose(T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

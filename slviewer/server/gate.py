@@ -172,6 +172,10 @@ def check_value(handle: Any, value: Any) -> None:
             _check(isinstance(value, str) and _is_plain_text(value, handle.multiline), "not plain text")
         case viser.GuiNumberHandle() | viser.GuiSliderHandle():
             _check_number(value, handle.value, handle.min, handle.max)
+        case viser.GuiVector3Handle():
+            _check(isinstance(value, list | tuple) and len(value) == 3, "not three numbers", correct=True)
+            for i, number in enumerate(value):
+                _check_number(number, handle.value[i], handle.min and handle.min[i], handle.max and handle.max[i])
         case _:  # uploads have messages of their own, and the wizard has no other inputs
             raise MessageRefused("this input takes no value")
 

@@ -58,7 +58,7 @@ class Edit:
 
 def describe_edit(what: str, points: int) -> str:
     """Describe an edit in a line: how its points were selected, and how many it deleted."""
-    return f"{what}: {points} points deleted"
+    return f"{what}: {points:,} points deleted"
 
 
 @dataclass(frozen=True, eq=False)

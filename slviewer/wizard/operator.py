@@ -12,6 +12,7 @@ from typing import Protocol
 from slviewer.errors import InputError, SlviewerError
 from slviewer.pipeline.rig_choice import Choice, SetUp, set_up
 from slviewer.session.store import Session
+from slviewer.wizard.edit_requests import EditRequests
 from slviewer.wizard.engine import Engine
 from slviewer.wizard.import_requests import ImportRequests
 from slviewer.wizard.live_requests import LiveRequests
@@ -37,7 +38,7 @@ class AutopilotLike(Protocol):
         """Stop sending requests."""
 
 
-class Operator(RigRequests, LiveRequests, TurnRequests, MeasureRequests, ImportRequests):
+class Operator(RigRequests, LiveRequests, TurnRequests, MeasureRequests, EditRequests, ImportRequests):
     """The wizard: requests in, snapshots out. Close it, or use it in a `with` block."""
 
     def __init__(self, session: Path | str | None = None, rig: Choice | None = None, *, set_up: SetUp = set_up) -> None:

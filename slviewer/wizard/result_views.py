@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -17,9 +17,11 @@ from slviewer.pipeline.align import AlignedScans, view_aligned
 from slviewer.pipeline.models import load_model, load_stereo
 from slviewer.pipeline.poses import load_observations
 from slviewer.pipeline.report import curve_at
+from slviewer.pipeline.scan_edits import restriction_mask
 from slviewer.report.data import PixelCurve
 from slviewer.session.capture import Capture
 from slviewer.session.ply import Ply, read_ply
+from slviewer.session.scan_edits import load_region
 from slviewer.session.store import Session
 from slviewer.wizard.snapshot import MergedLoop, MergedPair, MergeView
 
@@ -46,6 +48,11 @@ class ScanCloud:
     sigma_calibration: np.ndarray | None = None
     sigma_edges: np.ndarray | None = None
 
+    @property
+    def measured_count(self) -> int:
+        """How many of its points are not NaN."""
+        return int(np.count_nonzero(np.isfinite(self.points[..., 2])))
+
     def nearest(self, origin: np.ndarray, direction: np.ndarray) -> tuple[int, int] | None:
         """Return (u, v) of the measured pixel closest to a ray (camera frame, mm); None if none is near."""
         index = nearest(self.points, origin, direction)
@@ -66,7 +73,23 @@ def nearest(points: np.ndarray, origin: np.ndarray, direction: np.ndarray) -> tu
 
 
 def scan_cloud(session: Session, name: str) -> ScanCloud:
-    """Load the reconstructed cloud of a capture. Raises InputError where it was not reconstructed."""
+    """Load the reconstructed cloud of a capture, of a scan without what edits and region remove.
+
+    Raises InputError where it was not reconstructed, or nothing remains of it.
+    """
+    return used_points(session, whole_cloud(session, name))
+
+
+def used_points(session: Session, cloud: ScanCloud) -> ScanCloud:
+    """Return a scan's cloud with NaN for what edits and region remove. InputError where nothing remains."""
+    if session.load_capture(cloud.name).role != "scan":
+        return cloud
+    kept = restriction_mask(session, cloud.name, cloud.points, load_region(session))
+    return cloud if kept is None else replace(cloud, points=np.where(kept[..., None], cloud.points, np.float32(np.nan)))
+
+
+def whole_cloud(session: Session, name: str) -> ScanCloud:
+    """Load the reconstructed cloud of a capture with all of its points. Raises InputError where there is none."""
     meta, arrays = session.load_result(f"clouds/{name}")
     errors = error_maps(session, name) if f"verify/{name}" in session.result_names() else {}
     return ScanCloud(name=name, model=meta["model"], axis=meta["axis"], errors=errors, **arrays)

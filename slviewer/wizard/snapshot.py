@@ -328,6 +328,11 @@ class SessionView:
         """What the poses cover; None before the devices' sizes are known."""
         return None if self.plan is None else self.plan.coverage
 
+    def restriction(self, scan: str) -> tuple[RegionOfInterest | None, tuple[str, ...]]:
+        """Return what the points of a scan are restricted by: the region in effect, and its edits."""
+        edits = next((each.edits for each in self.scans if each.name == scan), ())
+        return self.region if self.region_is_on else None, edits
+
     @property
     def suggestion(self) -> Suggestion | None:
         """The suggested next pose; None where there is no suggestion."""

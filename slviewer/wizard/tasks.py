@@ -100,7 +100,7 @@ def reconstruct_capture(session: Session, name: str, model: str | None, report: 
         meta = {
             "model": model,
             "axis": cloud.axis,
-            "points": made.points,
+            "points": int(np.count_nonzero(cloud.mask)),
             "depth_mm": [float(near), float(far)],
             "noise_mm": float(np.median(cloud.sigma_z[cloud.mask])),
             "masked": made.masked,

@@ -139,7 +139,7 @@ def test_edits_are_stored_undone_and_redone(session: Path, cloud: np.ndarray, tm
     assert 0.4 * total < left < 0.6 * total
     assert edited.remaining == total - left
     assert reconstruct(session, "one", out=tmp_path / "cut.ply").points == total - left
-    assert len(edited.edits) == 1 and str(left) in edited.edits[0]
+    assert len(edited.edits) == 1 and f"{left:,}" in edited.edits[0]
     rows, columns = np.nonzero(np.isfinite(cloud[..., 2]) & (np.arange(w) > half[2]))
     part = (int(columns[500]), int(rows[500]))
     with pytest.raises(InputError, match="no point"):  # the object is one part

@@ -57,6 +57,11 @@ CASES = {
     "dropdown": (lambda g: g.add_dropdown("x", ("a", "b")), ["b"], ["c", "", 0, None, ["a"]]),
     "choice": (lambda g: g.add_button_group("x", ("a", "b")), ["b"], ["c", True]),
     "vector2": (lambda g: g.add_vector2("x", (0.0, 0.0)), [], [[1, 0.5], [2, 0], 1]),
+    "vector3": (
+        lambda g: g.add_vector3("x", (1.0, 2.0, 3.0), min=(0.0, 0.0, 0.0)),
+        [[0, 0.5, 7], [1.0, 2.0, 4.0]],
+        [[1, 2], [1, 2, 3, 4], [1, -1, 2], [1, math.nan, 2], ["1", 2, 3], [1, True, 2], [[1], 2, 3], 5, None, "123"],
+    ),
     "rgb": (lambda g: g.add_rgb("x", (1, 2, 3)), [], [[0, 255, 7], "red"]),
     "range": (lambda g: g.add_multi_slider("x", 0, 9, 1, (2, 5)), [], [[0, 9], [5, 2]]),
     "progress": (lambda g: g.add_progress_bar(5.0), [], [6, 7.0]),

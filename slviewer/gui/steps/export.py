@@ -231,7 +231,7 @@ class Panel(StepPanel):
             self._painter.cancel("cloud")
             self._scene.clear(LAYER)
             return
-        clouds = {scan.name: (scan.points, scan.model) for scan in session.scans}
+        clouds = {scan.name: (scan.points, scan.model, session.restriction(scan.name)) for scan in session.scans}
 
         def load() -> tuple[np.ndarray, np.ndarray | None]:
             """Load points (..., 3) mm and colours of the source; None: it has no colours."""

@@ -1,5 +1,6 @@
 """Step 7: choose scans, the reference and the initial alignment; merge, and compare before with after."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -160,7 +161,11 @@ class Panel(StepPanel):
             if snapshot is None or session is None:
                 return
             names, start = self._list_chosen(), self._start.value
-            versions = {scan.name: (scan.points, scan.model) for scan in session.scans if scan.cloud != "absent"}
+            versions = {
+                scan.name: (scan.points, scan.model, session.restriction(scan.name))
+                for scan in session.scans
+                if scan.cloud != "absent"
+            }
             labels = {scan.name: scan.label for scan in session.scans}
             stored = self._get_stored_angles(names)
             change(self._angle, visible=start == TURNTABLE and stored is None)
@@ -178,7 +183,7 @@ class Panel(StepPanel):
                 self._request_clouds(session, names, versions, labels)
 
     def _request_clouds(
-        self, session: SessionView, names: list[str], versions: dict[str, tuple[int, str]], labels: dict[str, str]
+        self, session: SessionView, names: list[str], versions: Mapping[str, Any], labels: dict[str, str]
     ) -> None:
         """Request the clouds of the chosen view."""
         merge, view, context = session.merge, self._view.value, self._context

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import viser
 
+from slviewer.errors import InputError
 from slviewer.fringe.presets import PRESETS
 from slviewer.gui.exposures import ExposureInputs
 from slviewer.gui.import_inputs import ImportInputs
@@ -13,7 +14,9 @@ from slviewer.gui.inputs import Choice, RestoreButton, SessionValue, change, dis
 from slviewer.gui.live import LAYER as LIVE
 from slviewer.gui.live import LiveScreen
 from slviewer.gui.panel import PanelContext, StepPanel
+from slviewer.gui.point_editing import PointEditing
 from slviewer.gui.preview import draw_preview, exposure_html, legend
+from slviewer.gui.region_inputs import RegionInputs
 from slviewer.gui.simulated_object import SimulatedObject
 from slviewer.gui.steps.verify import MUCH_MASKED, shape_of
 from slviewer.gui.turning import TurnInputs
@@ -34,7 +37,7 @@ from slviewer.gui.widgets import (
 )
 from slviewer.report.maps import error_limit
 from slviewer.simulation.concave import CONCAVE
-from slviewer.wizard.result_views import AlignedScans, ScanCloud, aligned_scans, scan_cloud
+from slviewer.wizard.result_views import AlignedScans, ScanCloud, aligned_scans, used_points, whole_cloud
 from slviewer.wizard.snapshot import LiveView, PreviewView, ScanView, Snapshot
 
 LAYER = "scan"
@@ -59,6 +62,8 @@ class Panel(StepPanel):
         self._placed: tuple[str, ...] | None = None
         self._cloud: ScanCloud | None = None
         self._loaded: tuple[Any, ScanCloud] | None = None
+        self._whole: ScanCloud | None = None
+        self._redraws = 0
         self._is_live = False
         self._screen = LiveScreen(context)
         context.operator.subscribe_live(self._screen.offer)
@@ -115,6 +120,8 @@ class Panel(StepPanel):
             self._legend = Text(gui)
             context.view_button(lambda: self._cloud.points if self._cloud else None)
             self._point = Text(gui)
+            self._region = RegionInputs(context, LAYER)
+            self._editing = PointEditing(context, LAYER, self._redraw, self._show_point)
             self._new_name = gui.add_text("New name", "")
             context.button(
                 "Rename scan", lambda: operator.rename(self._scan.value, self._new_name.value), viser.Icon.PENCIL
@@ -175,7 +182,7 @@ class Panel(StepPanel):
         super().show(visible)
         if not visible:
             self._operator.stop_live()
-        self._scene.on_pick(self._show_point if visible else None)
+        self._editing.show(visible)
         self._show_view()
 
     # drawing
@@ -204,7 +211,8 @@ class Panel(StepPanel):
     def _clear_cloud(self) -> None:
         """Remove the captured cloud with its legend and picked point."""
         self._painter.cancel("cloud")
-        self._cloud = None
+        self._cloud = self._whole = None
+        self._editing.set_cloud(None)
         for name in ("cloud", "picked"):
             self._scene.remove(LAYER, name)
         self._legend.set("")
@@ -220,6 +228,8 @@ class Panel(StepPanel):
             label = "Reconstruct" if scan.cloud == "absent" else "Reconstruct again"
             change(self._reconstruct, disabled=self._snapshot.is_busy, label=label)
             self._figures.set(scan_html(scan))
+            self._region.draw(session, scan.name if scan.cloud != "absent" else "")
+            self._editing.draw(scan)
             self._draw_placement(scan, self._snapshot.is_busy)
             self._gallery.set(gallery(sort_scans(session.scans) if session else (), scan.name))
             if self._is_live:
@@ -238,13 +248,19 @@ class Panel(StepPanel):
             key = (scan.name, scan.model, scan.points, scan.noise_mm, verified)
             colour = self._colour.value
 
-            def make() -> tuple[ScanCloud, str]:
-                """Load the cloud, unless it is loaded already; returns it and the chosen colours."""
+            def make() -> tuple[ScanCloud, ScanCloud, str, str]:
+                """Load the cloud, unless it is loaded already; returns it, what is used of it, the chosen colours, and
+                why nothing is used."""
                 if self._loaded is None or self._loaded[0] != key:
-                    self._loaded = key, scan_cloud(self._context.session, scan.name)
-                return self._loaded[1], colour
+                    self._loaded = key, whole_cloud(self._context.session, scan.name)
+                whole = self._loaded[1]
+                try:
+                    return whole, used_points(self._context.session, whole), colour, ""
+                except InputError as error:  # all is shown, so that the region can be put around it
+                    return whole, whole, colour, str(error)
 
-            self._painter.request("cloud", (key, colour), make, self._draw_cloud)
+            used = session.restriction(scan.name) if session else None
+            self._painter.request("cloud", (key, used, self._redraws, colour), make, self._draw_cloud)
 
     def _offer_views(self, scans: Sequence[ScanView]) -> None:
         """Offer to view the aligned scans together, and do so when another one came to its place."""
@@ -267,7 +283,8 @@ class Panel(StepPanel):
         """Draw the scans in place, in the colours of how many see each point."""
         if self._is_live:
             return
-        self._cloud = None
+        self._cloud = self._whole = None
+        self._editing.set_cloud(None)
         self._scene.remove(LAYER, "picked")
         self._point.set("")
         painted = np.where(aligned.seen_by[:, None] > 1, SEEN_AGAIN, SEEN_ONCE)
@@ -280,18 +297,27 @@ class Panel(StepPanel):
         if self._visible:
             self._context.viewpoints.show(f"{LAYER} {ALIGNED}", aligned.points)
 
-    def _draw_cloud(self, made: tuple[ScanCloud, str]) -> None:
-        """Draw a loaded cloud in the chosen colours, unless a live scan runs."""
-        cloud, colour = made
+    def _redraw(self) -> None:
+        """Draw the cloud again, as other points of it are hidden."""
+        self._redraws += 1
+        self._refresh()
+
+    def _draw_cloud(self, made: tuple[ScanCloud, ScanCloud, str, str]) -> None:
+        """Draw what is used of a loaded cloud in the chosen colours, unless a live scan runs."""
+        whole, cloud, colour, why = made
         if self._is_live:
             return
-        is_new = cloud is not self._cloud
-        self._cloud = cloud
+        is_new = whole is not self._whole
+        self._whole, self._cloud = whole, cloud
         painted, bar = painting(cloud, colour)
-        shown = self._scene.cloud(LAYER, "cloud", cloud.points, painted)
+        points = self._editing.set_cloud(cloud)
+        assert points is not None
+        shown = self._scene.cloud(LAYER, "cloud", points, painted)
         self._scene.show(LAYER, self._visible)
-        note = f"{shown:,} points shown; the file has all. Click a point for its values."
-        self._legend.set(bar + paragraph(coloured(note, "dim")))
+        removed = int(whole.measured_count - cloud.measured_count)
+        kept = f", {removed:,} removed by edits and region" if removed else "; the file has all"
+        note = f"{shown:,} points shown{kept}. Click a point for its values."
+        self._legend.set(bar + paragraph(coloured(note, "dim")) + (alert(why, "warning") if why else ""))
         if is_new:
             self._scene.remove(LAYER, "picked")
             self._point.set("")

@@ -160,7 +160,7 @@ class Panel(StepPanel):
             self._painter.request(
                 "cloud",
                 (key, model),
-                lambda: (result_views.scan_cloud(context.session, name), model, view.shape),
+                lambda: (result_views.whole_cloud(context.session, name), model, view.shape),
                 self._draw_cloud,
             )
 

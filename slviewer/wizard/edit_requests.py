@@ -1,0 +1,53 @@
+"""Requests to set the region of interest, and to delete points of scans so that they can be brought back."""
+
+import numpy as np
+
+from slviewer.errors import InputError
+from slviewer.pipeline.edit import change_history, delete_points
+from slviewer.session.scan_edits import load_region, save_region
+from slviewer.surface.region_of_interest import RegionOfInterest
+from slviewer.surface.selection import SupportPlane
+from slviewer.wizard.requests import RequestHandler, request
+from slviewer.wizard.result_views import whole_cloud
+
+
+class EditRequests(RequestHandler):
+    """Requests that change which points of scans are used."""
+
+    @request("Setting the region")
+    def set_region(self, region: RegionOfInterest, on: bool = True) -> None:
+        """Make a box the session's region of interest, in effect or not."""
+        save_region(self._engine.store, region, on)
+
+    @request("Switching the region")
+    def switch_region(self, on: bool) -> None:
+        """Put the last region of interest into effect, or use all points."""
+        store = self._engine.store
+        region = load_region(store, even_if_off=True)
+        if region is None:
+            raise InputError("there is no region yet: take the automatic one of a scan")
+        save_region(store, region, on)
+
+    @request("Setting the region")
+    def fit_region(self, scan: str) -> None:
+        """Make the box around all points of a reconstructed scan the region of interest."""
+        store = self._engine.store
+        save_region(store, RegionOfInterest.around(whole_cloud(store, scan).points))
+
+    @request("Deleting points")
+    def delete_points(
+        self, scan: str, points: np.ndarray, selected: np.ndarray, what: str, plane: SupportPlane | None = None
+    ) -> None:
+        """Delete the ``selected`` (h, w) of the points (h, w, 3) mm that are shown of a scan; `undo_edit` undoes it."""
+        count = delete_points(self._engine.store, scan, points, selected, what, plane)
+        self._engine.notices.add("info", f"{scan}: {count:,} points deleted; Undo brings them back")
+
+    @request("Undoing the edit")
+    def undo_edit(self, scan: str) -> None:
+        """Undo the last edit of a scan."""
+        change_history(self._engine.store, scan, undo=1)
+
+    @request("Redoing the edit")
+    def redo_edit(self, scan: str) -> None:
+        """Bring the last edit that was undone back."""
+        change_history(self._engine.store, scan, redo=1)

@@ -1,0 +1,166 @@
+"""Region of interest and editing of points in the step Scan, as someone uses them in a browser."""
+
+import re
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from playwright.sync_api import Browser, Page, expect
+from wizard_page import SIZE, Opened, button, choose, cut_labels, field
+
+from slviewer.devices.simulated import simulated_rig
+from slviewer.devices.world import SimulatedWorld
+from slviewer.gui.app import App
+from slviewer.gui.scene import read_view
+from slviewer.pipeline.capture import capture
+from slviewer.pipeline.rig_choice import RigSetup
+from slviewer.server.secure import Serving
+from slviewer.session.scan_edits import load_edits
+from slviewer.simulation.rig import letter
+from slviewer.validation.bench_live import true_calibration
+from slviewer.wizard.operator import Operator
+from slviewer.wizard.result_views import scan_cloud, whole_cloud
+
+PATIENCE_S = 40.0
+
+
+@pytest.fixture
+def wizard(tmp_path: Path, browser: Browser) -> Iterator[tuple[Opened, App, Operator]]:
+    """A page in the step Scan of a session with one reconstructed scan, without a rig."""
+    folder, rig = tmp_path / "session", letter(0.25)
+    true_calibration(folder, rig)
+    world = SimulatedWorld(rig)
+    world.place("object")
+    capture(folder, "one", {}, role="scan", patterns="gray", set_up=lambda *_: RigSetup(simulated_rig(world)))
+    with Operator(folder) as operator:
+        operator.reconstruct("one")
+        operator.wait_until_idle()
+        app = App(operator, Serving(port=0))
+        page = browser.new_page(viewport=SIZE)
+        page.set_default_timeout(20_000)
+        opened = Opened(page)
+        page.goto(app.server.link())
+        button(page, "6. Scan").click()
+        expect(page.get_by_text(re.compile("points shown; the file has all"))).to_be_visible(timeout=PATIENCE_S * 1000)
+        yield opened, app, operator
+        page.close()
+        app.close()
+
+
+def wait_until(page: Page, holds: Callable[[], bool]) -> None:
+    """Let the page work until something holds."""
+    end = time.monotonic() + PATIENCE_S
+    while not holds():
+        assert time.monotonic() < end, "it did not come about"
+        page.wait_for_timeout(100)
+
+
+def unfold(page: Page, folder: str) -> None:
+    """Open a folder of the panel, which is closed at first."""
+    page.get_by_text(folder, exact=True).click()
+
+
+def to_screen(app: App, page: Page, point: np.ndarray) -> tuple[float, float]:
+    """Where a point (3,) mm is on the page, px."""
+    (client,) = app.server.viser.get_clients().values()
+    x, y = read_view(client).project(point)
+    box = page.locator("canvas").first.bounding_box()
+    assert box is not None
+    return box["x"] + x * box["width"], box["y"] + y * box["height"]
+
+
+def count_selected(page: Page) -> int:
+    text = page.get_by_text(re.compile(r"of [\d,]+ points selected")).text_content() or ""
+    return int(text.split(" of ")[0].replace(",", ""))
+
+
+def test_points_are_selected_deleted_and_brought_back(wizard: tuple[Opened, App, Operator]) -> None:
+    opened, app, operator = wizard
+    page = opened.page
+    assert operator.session is not None
+    cloud = whole_cloud(operator.session, "one")
+    valid = np.argwhere(np.isfinite(cloud.points[..., 2]))
+    v, u = valid[np.argmin(np.abs(valid - np.median(valid, axis=0)).sum(axis=1))]
+    unfold(page, "Edit points")
+    choose(page, "Select by", "polygon")
+    page.wait_for_timeout(1500)  # the view moves to the cloud
+    x, y = to_screen(app, page, cloud.points[v, u])
+    for dx, dy in ((-30, -30), (30, -30), (30, 30), (-30, 30)):
+        page.mouse.click(x + dx, y + dy)
+        page.wait_for_timeout(400)
+    button(page, "Close outline").click()
+    wait_until(page, lambda: count_selected(page) > 0)
+    selected = count_selected(page)
+    assert 20 < selected < 0.5 * len(valid)
+    button(page, "Delete selected").click()
+    wait_until(page, lambda: len(operator.snapshot().scan("one").edits) == 1)  # type: ignore[union-attr]
+    (edit,) = load_edits(operator.session, "one").active
+    assert edit.pixels is not None and edit.pixels[v, u] and edit.points == selected
+    expect(page.get_by_text(re.compile(f"{selected:,} removed by edits"))).to_be_visible()
+    assert scan_cloud(operator.session, "one").measured_count == len(valid) - selected
+
+    choose(page, "Select by", "rectangle")
+    page.wait_for_timeout(500)
+    page.mouse.move(x - 60, y - 60)
+    page.mouse.down()
+    page.mouse.move(x, y, steps=4)
+    page.mouse.move(x + 60, y + 60, steps=4)
+    page.mouse.up()
+    wait_until(page, lambda: count_selected(page) > 0)
+    button(page, "Invert selection").click()
+    total = len(valid) - selected
+    wait_until(page, lambda: count_selected(page) > 0.3 * total)
+    button(page, "Hide selected").click()
+    expect(page.get_by_text(re.compile(r"[\d,]+ hidden"))).to_be_visible()
+    assert len(operator.snapshot().scan("one").edits) == 1  # type: ignore[union-attr]
+    button(page, "Show hidden").click()
+    button(page, "Undo edit").click()
+    wait_until(page, lambda: not operator.snapshot().scan("one").edits)  # type: ignore[union-attr]
+    expect(page.get_by_text(re.compile("points shown; the file has all"))).to_be_visible()
+    button(page, "Redo edit").click()
+    wait_until(page, lambda: len(operator.snapshot().scan("one").edits) == 1)  # type: ignore[union-attr]
+    assert cut_labels(page) == []
+    assert opened.errors == []
+
+
+def test_the_region_is_placed_by_numbers_and_by_its_handle(wizard: tuple[Opened, App, Operator]) -> None:
+    opened, app, operator = wizard
+    page = opened.page
+    assert operator.session is not None
+    total = whole_cloud(operator.session, "one").measured_count
+
+    def region():  # type: ignore[no-untyped-def]
+        session = operator.snapshot().session
+        assert session is not None
+        return session.region if session.region_is_on else None
+
+    unfold(page, "Region of interest")
+    button(page, "Automatic region").click()
+    wait_until(page, lambda: region() is not None)
+    automatic = region()
+    assert scan_cloud(operator.session, "one").measured_count > 0.995 * total
+    field(page, "Size (mm)").fill(f"{automatic.size_mm[0] / 2:.1f}")
+    wait_until(page, lambda: abs(region().size_mm[0] - automatic.size_mm[0] / 2) < 0.1)
+    assert 0.2 * total < scan_cloud(operator.session, "one").measured_count < 0.9 * total
+    expect(page.get_by_text(re.compile("removed by edits and region"))).to_be_visible()
+    page.locator("xpath=//*[normalize-space(text())='Handles']/following::input[1]").check()
+    page.wait_for_timeout(1500)
+    # the arrow along x
+    arrow = np.array([0.5 * 0.6 * max(region().size_mm), 0, 0])
+    x, y = to_screen(app, page, np.array(region().centre_mm) + arrow)
+    page.mouse.move(x, y)
+    page.mouse.down()
+    page.mouse.move(x + 20, y, steps=4)
+    page.mouse.move(x + 60, y, steps=6)
+    page.mouse.up()
+    wait_until(page, lambda: abs(region().centre_mm[0] - automatic.centre_mm[0]) > 1)
+    assert np.allclose(region().size_mm[1:], automatic.size_mm[1:], atol=0.11)
+    field(page, "Centre (mm)").fill("5000")
+    expect(page.get_by_text(re.compile(r"none of its \d+ points lies in the region"))).to_be_visible()
+    page.locator("xpath=//*[normalize-space(text())='Use region']/following::input[1]").uncheck()
+    wait_until(page, lambda: region() is None)
+    expect(page.get_by_text(re.compile("points shown; the file has all"))).to_be_visible()
+    assert cut_labels(page) == []
+    assert opened.errors == []
