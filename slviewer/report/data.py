@@ -248,6 +248,7 @@ class SessionData:
 
     ``verdict`` is that on the last attempt to calibrate; ``verdict_of_calibration``: whether that made ``calibration``.
     ``sections``: names, and lines (k, 2) mm, along and up; ``deviations`` from nominal models, with their arrays.
+    ``region``: the region of interest that is in effect, in words; ``edits`` of scans in their order: scan and words.
     """
 
     name: str
@@ -265,3 +266,5 @@ class SessionData:
     measurements: Sequence[Measurement] = ()  # but deviations
     sections: Sequence[tuple[str, Sequence[np.ndarray]]] = ()
     deviations: Sequence[tuple[Measurement, Mapping[str, np.ndarray]]] = ()
+    region: str = ""
+    edits: Sequence[tuple[str, str]] = ()

@@ -111,6 +111,8 @@ def session_sections(data: SessionData) -> list[Section]:
         sections.append(measurements_section(data.measurements, data.sections))
     if data.deviations:
         sections.append(deviations_section(data.deviations))
+    if data.region or data.edits:
+        sections.append(_restrictions_section(data))
     return [*sections, _captures_section(data)]
 
 
@@ -120,6 +122,14 @@ def _notice_section(data: SessionData) -> list[Section]:
     items: list[Item] = [PageNotice(warning) for warning in data.warnings]
     items += [PageNotice(f"{row.name} is {row.state}: {row.why or 'no reason was given'}") for row in unused]
     return [Section("Warnings", "", items)] if items else []
+
+
+def _restrictions_section(data: SessionData) -> Section:
+    """The section with the region of interest, and the points that were deleted from scans."""
+    text = f"Points of scans outside of the region of interest are not used: {data.region}." if data.region else ""
+    columns = [Column("scan", align="left"), Column("edit", align="left")]
+    table = Table(columns, [[scan, words] for scan, words in data.edits], "Edits in effect, in their order")
+    return Section("Region and edits", text, [table] if data.edits else [])
 
 
 def _captures_section(data: SessionData) -> Section:

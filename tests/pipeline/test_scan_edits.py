@@ -18,6 +18,7 @@ from slviewer.pipeline.measured_surface import load_surface
 from slviewer.pipeline.merge import merge
 from slviewer.pipeline.mesh import mesh
 from slviewer.pipeline.reconstruct import reconstruct
+from slviewer.pipeline.report import report
 from slviewer.pipeline.rig_choice import RigSetup
 from slviewer.pipeline.scan_edits import parse_region
 from slviewer.session.ply import read_ply
@@ -164,6 +165,22 @@ def test_edits_are_stored_undone_and_redone(session: Path, cloud: np.ndarray, tm
 def load(session: Path) -> EditHistory:
     with Session.open(session) as store:
         return load_edits(store, "one")
+
+
+def test_the_report_and_the_files_list_region_and_edits(session: Path, cloud: np.ndarray, tmp_path: Path) -> None:
+    report(session, tmp_path / "before.html")
+    assert "Region and edits" not in (tmp_path / "before.html").read_text()
+    edited = edit_scan(session, "one", polygon=left_half(cloud))
+    text = set_region(session, roi="-500,500,-500,500,10,2000")
+    report(session, tmp_path / "after.html")
+    page = (tmp_path / "after.html").read_text()
+    assert "Region and edits" in page and edited.edits[0] in page and "1000.0 x 1000.0 x 1990.0 mm" in page + text
+    header = export(session, "cloud", "one").path.read_bytes()[:3000].split(b"end_header")[0].decode()
+    assert edited.edits[0] in header and "1000.0 x 1000.0 x 1990.0 mm" in header
+    file = session / "results/edits/one/meta.json"
+    file.write_text(file.read_text().replace('"applied": 1', '"applied": "x"'))
+    report(session, tmp_path / "damaged.html")
+    assert "meta.json" in (tmp_path / "damaged.html").read_text()
 
 
 def test_results_are_stale_once_edits_or_region_change(session: Path, cloud: np.ndarray) -> None:

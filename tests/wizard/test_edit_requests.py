@@ -1,0 +1,88 @@
+"""Region and edits as an operator requests them: granted, or refused with a notice."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from slviewer.devices.simulated import simulated_rig
+from slviewer.devices.world import SimulatedWorld
+from slviewer.pipeline.capture import capture
+from slviewer.pipeline.merge import merge
+from slviewer.pipeline.rig_choice import RigSetup
+from slviewer.simulation.rig import letter
+from slviewer.surface.region_of_interest import RegionOfInterest
+from slviewer.surface.selection import SupportPlane
+from slviewer.validation.bench_live import true_calibration
+from slviewer.wizard.operator import Operator
+from slviewer.wizard.result_views import whole_cloud
+from slviewer.wizard.snapshot import SessionView
+
+FAR = RegionOfInterest((0.0, 0.0, 9000.0), (10.0, 10.0, 10.0))
+
+
+@pytest.fixture
+def operator(tmp_path: Path):  # type: ignore[no-untyped-def]
+    """Over a session whose calibration is the truth, with two scans, of which the first is reconstructed."""
+    folder, rig = tmp_path / "session", letter(0.25)
+    true_calibration(folder, rig)
+    world = SimulatedWorld(rig)
+    world.place("object")
+    for name in ("one", "two"):
+        capture(folder, name, {}, role="scan", patterns="gray", set_up=lambda *_: RigSetup(simulated_rig(world)))
+    with Operator(folder) as engine:
+        engine.reconstruct("one")
+        engine.wait_until_idle()
+        yield engine
+
+
+def view(operator: Operator) -> SessionView:
+    session = operator.wait_until_idle().session
+    assert session is not None
+    return session
+
+
+def test_edits_and_region_change_what_is_measured_and_merged(operator: Operator) -> None:
+    store = operator.session
+    assert store is not None
+    merge(store, ["two"], "one", start="identity")
+    points = whole_cloud(store, "one").points
+    total = int(np.isfinite(points[..., 2]).sum())
+    nearer = points[..., 2] < np.nanmedian(points[..., 2])
+    assert operator.delete_points("one", points, nearer, "the nearer half")
+    session = view(operator)
+    assert session.merge is not None and session.merge.stale
+    assert len(session.scans[0].edits) == 1 and session.scans[0].cloud == "fresh"
+    on = operator.surface("one")
+    assert 0.45 * total < on.measured.sum() < 0.55 * total
+    assert operator.undo_edit("one")
+    session = view(operator)
+    assert session.scans[0].undone_edits == 1 and not session.scans[0].edits
+    assert session.merge is not None and not session.merge.stale
+    assert operator.surface("one").measured.sum() == total
+    plane = SupportPlane((0.0, 0.0, -1.0), -float(np.nanmedian(points[..., 2])), 0.0)
+    assert operator.delete_points("one", points, plane.select_below(points), "support", plane)
+    assert operator.surface("one").measured.sum() < 0.6 * total
+    assert operator.undo_edit("one") and not operator.undo_edit("one") and operator.redo_edit("one")
+    assert operator.fit_region("one") and operator.switch_region(False)
+    session = view(operator)
+    assert session.region is not None and not session.region_is_on
+
+
+def test_what_leaves_nothing_is_refused_with_numbers(operator: Operator) -> None:
+    store = operator.session
+    assert store is not None
+    points = whole_cloud(store, "one").points
+    everything = np.ones(points.shape[:2], bool)
+    assert not operator.switch_region(True)
+    assert not operator.delete_points("one", points, everything, "everything")
+    assert not operator.delete_points("one", points, ~everything, "nothing")
+    assert not operator.redo_edit("one")
+    assert operator.set_region(FAR)
+    operator.reconstruct("two")
+    session = view(operator)
+    assert session.scans[1].cloud == "absent"
+    assert any("none of its" in notice.text and "9000" in notice.text for notice in operator.notices())
+    assert operator.switch_region(False)
+    operator.reconstruct("two")
+    assert view(operator).scans[1].cloud == "fresh"
