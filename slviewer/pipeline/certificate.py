@@ -43,9 +43,11 @@ from slviewer.pipeline.scale import load_scale_correction
 from slviewer.pipeline.verify import verify
 from slviewer.records import from_plain
 from slviewer.report.page import CERTIFICATE, Column, Section, Table, page_digest
+from slviewer.session.decisions import REGION_INPUT
 from slviewer.session.measurements import Measurement
 from slviewer.session.nominal import read_nominal
 from slviewer.session.reading import expand_user, read_file
+from slviewer.session.scan_edits import load_edits, load_region, restriction_inputs, save_edits, save_region
 from slviewer.session.store import Session
 
 SCHEMA = 1
@@ -271,6 +273,9 @@ def _recompute(
     with Session.create(folder) as fresh:
         for name in certificate.captures:
             _link(store.load_capture(name).folder, fresh.folder / "captures" / name)
+        for name in fresh.capture_names("scan"):
+            save_edits(fresh, name, load_edits(store, name))
+        save_region(fresh, load_region(store))
         if "calibration/stereo" in certificate.figures:
             progress(0.1, "calibrating")
             _calibrate_again(store, fresh, why)
@@ -301,7 +306,9 @@ def _calibrate_again(store: Session, fresh: Session, why: dict[str, str]) -> Non
             f"calibration/{name}": "it was imported: its figures are not from the session's frames" for name in models
         }
         for name in models:
-            fresh.save_result(f"calibration/{name}", *store.load_result(f"calibration/{name}"))
+            saved, arrays = store.load_result(f"calibration/{name}")
+            own = ("hash", "arrays", "checksums")  # which the session writes itself
+            fresh.save_result(f"calibration/{name}", {k: v for k, v in saved.items() if k not in own}, arrays)
         return
     left_out = [name for name, reason in stereo.excluded.items() if reason.startswith(_BY_OPERATOR)]
     poses = [name for name in (*stereo.poses, *stereo.excluded) if name not in left_out and name in fresh.taken_names()]
@@ -348,10 +355,23 @@ def _measure_again(
             why[result] = "merges are not registered again"
             continue
         with _noting(why, result):
+            _check_restrictions(store, measured)
             made = _repeat(store, fresh, measured, surface, again)
             again[measured.id] = made.id
             figures[result] = _measurement_figures(made)
     return figures
+
+
+def _check_restrictions(store: Session, measured: Measurement) -> None:
+    """Raise InputError where the edits and the region that a measurement was made with are not the session's."""
+    if measured.kind == "relation":
+        return
+    used = store.load_result(f"measurements/{measured.id}", only=())[0]["inputs"]
+    now = restriction_inputs(store, [measured.source])
+    if any(name in used for name in now) and REGION_INPUT not in used:
+        raise InputError("it was made with a region of its own")
+    if any(used.get(name, "") != value for name, value in now.items()):
+        raise InputError(f"edits of {measured.source}, or the region, have changed since")
 
 
 def _repeat(

@@ -13,7 +13,7 @@ from slviewer.calibration.observe import Observation
 from slviewer.calibration.pixelwise import PixelwiseModel, pixel_samples
 from slviewer.calibration.splined.model import SplinedModel
 from slviewer.calibration.stereo import StereoModel
-from slviewer.errors import DamagedError, InputError
+from slviewer.errors import InputError
 from slviewer.fringe.sequence import Axis
 from slviewer.pipeline.calibration_verdict import load_last_verdict
 from slviewer.pipeline.certificate import certificate_section, certify_page, make_certificate
@@ -106,7 +106,7 @@ def _collect_data(store: Session) -> SessionData:
     verdict = load_last_verdict(store)
     judged = store.load_result("calibration/stereo", only=())[0].get("verdict") if stereo is not None else None
     views, spacings = _list_verifications(store)
-    region, edits, damage = _read_restrictions(store)
+    region = load_region(store)
     return SessionData(
         name=store.folder.name,
         captures=[_describe_capture(c, stereo, excluded) for c in store.captures()],
@@ -114,14 +114,14 @@ def _collect_data(store: Session) -> SessionData:
         pixel_fits=fits,
         verifications=views,
         spacings=spacings,
-        warnings=[*stale, *damage],
+        warnings=stale,
         verdict=verdict,
         verdict_of_calibration=verdict is not None and judged is not None and from_plain(judged, Verdict) == verdict,
         models=_load_models(store),
         acceptances=_list_acceptances(store),
         drifts=_list_drifts(store),
-        region=region,
-        edits=edits,
+        region="" if region is None else region.text(),
+        edits=[(scan, words) for scan in store.capture_names("scan") for words in list_edits(store, scan)[0]],
         **measured_views(store),
     )
 
@@ -177,22 +177,6 @@ def _list_verifications(store: Session) -> tuple[list[VerificationView], list[Sp
             view = replace(view, maps=ErrorMaps(view.name, maps, view.rms_mm, floor))
         views.append(view)
     return views, centre_spacings(views)
-
-
-def _read_restrictions(store: Session) -> tuple[str, list[tuple[str, str]], list[str]]:
-    """Return the region in effect, in words, (scan, edit) for every edit in effect, and what of them is damaged."""
-    region, edits, damage = "", list[tuple[str, str]](), list[str]()
-    try:
-        box = load_region(store)
-        region = "" if box is None else box.text()
-    except DamagedError as error:
-        damage.append(str(error))
-    for scan in store.capture_names("scan"):
-        try:
-            edits += [(scan, words) for words in list_edits(store, scan)[0]]
-        except DamagedError as error:
-            damage.append(str(error))
-    return region, edits, damage
 
 
 def _describe_capture(capture: Capture, stereo: StereoModel | None, excluded: Mapping[str, str]) -> CaptureRow:
