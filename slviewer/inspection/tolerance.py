@@ -61,3 +61,14 @@ def judge_deviation(deviation: Deviation, sigma_mm: np.ndarray, tolerance_mm: fl
         100 * float(outside.mean()),
         100 * float(np.mean(~inside & ~outside)),
     )
+
+
+def judge_limits(value: float, U: float, lower: float | None, upper: float | None) -> Decision:
+    """Decide by guard bands whether a value of expanded uncertainty U (k = 2) lies between limits, of which one may be
+    absent: "pass" inside both by U, "fail" beyond one by more than U, else "undecided"."""
+    low, high = (-np.inf if lower is None else lower), (np.inf if upper is None else upper)
+    if not (np.isfinite(value) and np.isfinite(U)):
+        return "undecided"
+    if low + U <= value <= high - U:
+        return "pass"
+    return "fail" if value < low - U or value > high + U else "undecided"
