@@ -102,6 +102,15 @@ COMMANDS = Commands(
             run=partial(show_result, describe=describe_measurement),
         ),
         "measurements": partial(read_command, "pipeline.measure:edit_measurements", "session"),
+        "plan": partial(read_command, "pipeline.plan:plan", "session"),
+        "inspect-parts": partial(
+            read_command,
+            "pipeline.inspect_parts:inspect_parts",
+            "plan",
+            "sessions",
+            options=[JSON],
+            names={"scans": "scan"},
+        ),
         "export": partial(
             read_command,
             "pipeline.export:export",

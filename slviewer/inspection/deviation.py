@@ -11,7 +11,7 @@ from slviewer.errors import InputError
 from slviewer.geometry.rigid import move_points, turn_about
 from slviewer.inspection.nominal_surface import NominalSurface
 from slviewer.inspection.placing import search_start
-from slviewer.inspection.uncertainty import scatter_covariance
+from slviewer.inspection.uncertainty import RigidSpread, scatter_covariance
 from slviewer.registration.pairwise import Registration
 from slviewer.surface.shapes import Mesh
 
@@ -36,7 +36,8 @@ class Deviation:
     ``reach_mm``, or that face another way. ``T_nominal_scan`` (4, 4) is the best fit; ``normals`` (n, 3) the nominal's
     where each point's nearest place is, in the scan's frame, NaN likewise. ``coverage``: share of the nominal's area
     that was measured; ``uncovered`` (k, 3) mm: places of the rest, in the scan's frame. ``alignment_mm``: standard
-    uncertainty that the best fit adds to a point, RMS over the points.
+    uncertainty that the best fit adds to a point, RMS over the points; ``alignment_spread`` its covariance, in
+    the nominal's frame.
     """
 
     signed: np.ndarray
@@ -47,6 +48,7 @@ class Deviation:
     uncovered: np.ndarray
     alignment_mm: float
     start: Registration | None = None
+    alignment_spread: RigidSpread | None = None
 
     @property
     def counted(self) -> np.ndarray:
@@ -121,7 +123,7 @@ def deviation(
     if initial is None:
         start = search_start(points, normals, surface, sigma_mm, lambda share: report(0.6 * share))
         initial = start.T_reference_scan
-    T, alignment = _refine_best_fit(
+    T, alignment, spread = _refine_best_fit(
         points, normals, surface, initial, reach_mm, lambda share: report(0.6 + 0.2 * share)
     )
     report(0.8)
@@ -145,6 +147,7 @@ def deviation(
         move_points(back, uncovered).astype(np.float32),
         alignment,
         start,
+        spread,
     )
 
 
@@ -169,9 +172,9 @@ def _refine_best_fit(
     T: np.ndarray,
     reach: float,
     report: Callable[[float], None],
-) -> tuple[np.ndarray, float]:
-    """The pose of least squared distances of the points that belong to the nominal, by Gauss-Newton, and the standard
-    uncertainty, mm, that its own gives the points."""
+) -> tuple[np.ndarray, float, RigidSpread]:
+    """The pose of least squared distances of the points that belong to the nominal, by Gauss-Newton, the standard
+    uncertainty, mm, that its own gives the points, and its covariance."""
     step = -(-len(points) // MAX_ALIGNED_POINTS)
     points = points[::step]
     normals = None if normals is None else normals[::step]
@@ -194,7 +197,7 @@ def _refine_best_fit(
         if np.abs(J @ change).max() < 1e-5:
             break
     covariance = scatter_covariance(moved, J, away[counted])
-    return T, float(np.sqrt(np.einsum("ni,ij,nj->n", J, covariance, J).mean()))
+    return T, float(np.sqrt(np.einsum("ni,ij,nj->n", J, covariance, J).mean())), RigidSpread(middle, covariance)
 
 
 def _measure_coverage(feet: np.ndarray, surface: NominalSurface) -> tuple[float, np.ndarray]:

@@ -21,7 +21,7 @@ from slviewer.geometry.robust import robust_sigma
 from slviewer.inspection.features import Feature
 from slviewer.inspection.fitting import MAX_FITTED_POINTS, MAX_SHARED_POINTS, FeatureFit
 from slviewer.inspection.quantities import Quantity
-from slviewer.inspection.uncertainty import PATCHES, Shared, joint_covariance
+from slviewer.inspection.uncertainty import DRAWS, PATCHES, RigidSpread, Shared, draw_steps, joint_covariance
 
 FormKind = Literal["flatness", "roundness", "cylindricity"]
 OrientationKind = Literal["parallelism", "perpendicularity"]
@@ -29,7 +29,6 @@ FORM_KINDS: tuple[FormKind, ...] = get_args(FormKind)
 ORIENTATION_KINDS: tuple[OrientationKind, ...] = get_args(OrientationKind)
 DEGREE = 6
 """Of the polynomials across a region that count as form; what is finer is noise or unresolved."""
-DRAWS = 200
 MAX_DRAWN_POINTS = 2_000
 SPIKE_SIGMA = 5.0
 PATCH_SIGMA = 4.5
@@ -43,19 +42,6 @@ SECTION_SHARE = 0.1
 sphere's diameter."""
 MAX_TILT_DEG = 10.0
 """Features farther from parallel or perpendicular than this are not meant to be so."""
-
-
-@dataclass(frozen=True, eq=False)
-class RigidSpread:
-    """Covariance (6, 6) of a rigid motion's rotation vector (rad) about ``middle`` (3,) mm, and its shift (mm)."""
-
-    middle: np.ndarray
-    covariance: np.ndarray
-
-    def draw(self, rng: np.random.Generator) -> Callable[[np.ndarray], np.ndarray]:
-        """Draw `DRAWS` motions; returns what displaces points (n, 3): (draws, n, 3) mm."""
-        steps = draw_steps(self.covariance, rng)
-        return lambda points: np.cross(steps[:, None, :3], points - self.middle) + steps[:, None, 3:]
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,14 +138,16 @@ def zone_width(
         answers = (by_field @ smooth.basis) @ smooth.answer
         places = smooth.sampled
         variance += float(np.sum(shared(smooth.points[places], answers[None, :, None] * smooth.normals[places]) ** 2))
-    return _correct_for_noise(name, value, width(drawn), variance, shared is not None)
+    wider = field[chosen, None] + np.sqrt(2) * (drawn - field[chosen, None])
+    return _correct_for_noise(name, value, width(drawn), variance, shared is not None, width(wider))
 
 
 def form_error(kind: FormKind, fit: FeatureFit, points: np.ndarray, shared: Shared | None = None) -> Quantity:
     """Flatness of a plane, cylindricity of a cylinder, roundness of a section of a cylinder or a sphere, mm.
 
     ``points`` (n, 3) mm: of the region. A cylinder's section is perpendicular to its axis, in the middle; a sphere's
-    goes through its centre and the middle of what was measured. Raises InputError for another feature or too few points.
+    goes through its centre and the middle of what was measured. Raises InputError for another feature or for too few
+    points.
     """
     f = fit.feature
     wanted = {"flatness": ("plane",), "cylindricity": ("cylinder",), "roundness": ("sphere", "cylinder")}[kind]
@@ -303,16 +291,21 @@ def profile_error(
     )
 
 
-def draw_steps(covariance: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Draw `DRAWS` steps (draws, p) of parameters of a covariance (p, p)."""
-    values, vectors = np.linalg.eigh(covariance)
-    return np.asarray(rng.normal(size=(DRAWS, len(values))) * np.sqrt(np.maximum(values, 0)) @ vectors.T)
+def _correct_for_noise(
+    name: str, value: float, drawn: np.ndarray, variance: float, whole: bool, wider: np.ndarray | None = None
+) -> Quantity:
+    """Return a width (mm) less what noise adds to it, with that and the spread of the draws in U.
 
-
-def _correct_for_noise(name: str, value: float, drawn: np.ndarray, variance: float, whole: bool) -> Quantity:
-    """Return a width (mm) less what noise adds to it in the mean of the draws, with that and their spread in U."""
+    The measured width holds noise once, the ``drawn`` ones (draws,) twice, and ``wider`` three times in variance: these
+    are extrapolated to none (SIMEX, Cook and Stefanski 1994), by a line without ``wider``, else by a parabola.
+    """
     added = float(drawn.mean() - value)
-    sigma = float(np.sqrt(drawn.var() + added**2 / 3 + variance))
+    if wider is not None:
+        added = max(added, float(3 * drawn.mean() - 2 * value - wider.mean()))
+    added = min(added, value)
+    # where the form is no larger than what noise adds, all of it may be noise
+    share = min(max(1 / 3, abs(added) / max(value - added, 1e-12)), 0.7)
+    sigma = float(np.sqrt(drawn.var() + share * added**2 + variance))
     return Quantity(name, max(value - added, 0.0), "mm", sigma, whole)
 
 
@@ -370,7 +363,7 @@ def _patch_misfit(
         return 1.0, 0.0
     # the smooth part takes its share of the patches' freedom
     freedom = max(1 - columns / max(int(large.sum()), 1), 0.25)
-    factor = float(np.sqrt(max(np.mean((means[large] / expected[large]) ** 2) / freedom, 1.0)))
+    factor = float(np.sqrt(max(float(np.mean((means[large] / expected[large]) ** 2)) / freedom, 1.0)))
     beyond = np.abs(means[large]) - PATCH_SIGMA * expected[large]
     worst = int(np.argmax(beyond))
     # a defect seldom fills its patch

@@ -18,6 +18,9 @@ itself is the parameters' covariance by errors that no averaging lessens. The k 
 PATCHES = 8
 """Across a region: deviations within a patch are taken for one another's company, those of different patches not."""
 
+DRAWS = 200
+"""Of errors, where they are propagated by drawing them."""
+
 
 @dataclass(frozen=True, eq=False)
 class Spread:
@@ -40,6 +43,19 @@ class Spread:
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
 
+@dataclass(frozen=True, eq=False)
+class RigidSpread:
+    """Covariance (6, 6) of a rigid motion's rotation vector (rad) about ``middle`` (3,) mm, and its shift (mm)."""
+
+    middle: np.ndarray
+    covariance: np.ndarray
+
+    def draw(self, rng: np.random.Generator) -> Callable[[np.ndarray], np.ndarray]:
+        """Draw `DRAWS` motions; returns what displaces points (n, 3): (draws, n, 3) mm."""
+        steps = draw_steps(self.covariance, rng)
+        return lambda points: np.cross(steps[:, None, :3], points - self.middle) + steps[:, None, 3:]
+
+
 def joint_covariance(a: Spread, b: Spread) -> np.ndarray:
     """(p + q, p + q): the covariance of two features' parameters; errors of a calibration that both have, are one."""
     p = len(a.scatter)
@@ -49,6 +65,12 @@ def joint_covariance(a: Spread, b: Spread) -> np.ndarray:
         whole[:p, p:] = a.shared.T @ b.shared
         whole[p:, :p] = whole[:p, p:].T
     return whole
+
+
+def draw_steps(covariance: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Draw `DRAWS` steps (draws, p) of parameters of a covariance (p, p)."""
+    values, vectors = np.linalg.eigh(covariance)
+    return np.asarray(rng.normal(size=(DRAWS, len(values))) * np.sqrt(np.maximum(values, 0)) @ vectors.T)
 
 
 def propagate_covariance(f: Callable[[np.ndarray], float], covariance: np.ndarray) -> float:

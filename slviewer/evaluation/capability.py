@@ -1,0 +1,45 @@
+"""Capability of a process: Cp and Cpk of a sample against limits, with their confidence intervals."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import chi2, norm
+
+CONFIDENCE = 0.95
+MIN_PARTS = 3
+
+
+@dataclass(frozen=True)
+class Capability:
+    """Of ``parts`` values of this ``mean`` and standard deviation ``sigma``: ``cp`` (None for a single limit) and
+    ``cpk``, each with the ends of its 95 % confidence interval."""
+
+    parts: int
+    mean: float
+    sigma: float
+    cp: tuple[float, float, float] | None
+    cpk: tuple[float, float, float]
+
+
+def process_capability(values: Sequence[float], lower: float | None, upper: float | None) -> Capability | None:
+    """Estimate the capability of a process; None for fewer than 3 values, without a limit, or where they do not vary.
+
+    Cp's interval is exact for normal values (chi squared), Cpk's is Bissell's approximation (Applied Statistics 39,
+    1990). The spread of the values includes that of the measurement.
+    """
+    x = np.asarray(values, np.float64)
+    n = len(x)
+    if n < MIN_PARTS or (lower is None and upper is None) or not (sigma := float(x.std(ddof=1))) > 0:
+        return None
+    mean, tail = float(x.mean()), (1 - CONFIDENCE) / 2
+    cp = None
+    if lower is not None and upper is not None:
+        value = (upper - lower) / (6 * sigma)
+        low, high = (float(value * np.sqrt(chi2.ppf(p, n - 1) / (n - 1))) for p in (tail, 1 - tail))
+        cp = (value, low, high)
+    sides = [mean - lower] if lower is not None else []
+    sides += [upper - mean] if upper is not None else []
+    cpk = min(sides) / (3 * sigma)
+    reach = float(norm.ppf(1 - tail) * np.sqrt(1 / (9 * n) + cpk**2 / (2 * (n - 1))))
+    return Capability(n, mean, sigma, cp, (cpk, cpk - reach, cpk + reach))

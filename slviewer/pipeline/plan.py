@@ -1,0 +1,145 @@
+"""An inspection plan from the measurements of a session, to repeat them on other scans."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from slviewer.errors import InputError, UsageError
+from slviewer.inspection.datums import datum_frame
+from slviewer.inspection.features import Feature
+from slviewer.inspection.quantities import Quantity
+from slviewer.inspection.regions import Region
+from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
+from slviewer.pipeline.measured_surface import load_surface
+from slviewer.pipeline.measurements import load_feature, load_measurements, quantities_of
+from slviewer.pipeline.open_session import SessionLike, opened
+from slviewer.pipeline.part_inspection import fit_to_nominal
+from slviewer.records import from_plain
+from slviewer.session.inspection_plan import (
+    KINDS,
+    Alignment,
+    Characteristic,
+    Plan,
+    PlanFeature,
+    PlanRegion,
+    write_plan,
+)
+from slviewer.session.measurements import Measurement
+from slviewer.session.nominal import read_nominal
+
+TOLERANCE_MM = 0.1
+FITTED = ("plane", "sphere", "cylinder")
+FORM_OF = {"plane": "flatness", "sphere": "roundness", "cylinder": "cylindricity"}
+
+
+def plan(
+    session: SessionLike,
+    *,
+    out: Path = Path("plan.toml"),
+    tolerance: float = TOLERANCE_MM,
+    datums: tuple[str, str, str] | None = None,
+    nominal: Path | None = None,
+    progress: Progress = ignore_progress,
+    warn: Warn = ignore_warnings,
+) -> str:
+    """Make an inspection plan from what was measured on a scan, to repeat it on others with `slviewer inspect-parts`.
+
+    The plan is a text file: edit its nominal values and limits there.
+
+    Args:
+        session: Session folder.
+        out: The plan, a TOML file.
+        tolerance: Plus and minus around each measured size, mm (and degrees for angles); the upper limit of form.
+        datums: Align by these three measurements (3-2-1), such as m1 m2 m3: a plane, then planes or spheres.
+        nominal: Align by the best fit to this STL, PLY or OBJ file. By default parts lie in one place, in a fixture.
+    """
+    if not tolerance > 0:
+        raise UsageError(f"--tolerance is {tolerance:g}: give a positive one, in mm")
+    if datums and nominal is not None:
+        raise UsageError("--datums and --nominal were given: choose one way to align")
+    made = make_plan(session, tolerance, datums or (), nominal, Path(out).stem, progress=progress, warn=warn)
+    write_plan(made, out)
+    return (
+        f"{len(made.characteristic)} characteristics of {len(made.feature)} features -> {out}; set nominal values and "
+        f"limits there, then: slviewer inspect-parts {out} SESSION..."
+    )
+
+
+def make_plan(
+    session: SessionLike,
+    tolerance: float,
+    datums: Sequence[str] = (),
+    nominal: Path | None = None,
+    name: str = "plan",
+    *,
+    progress: Progress = ignore_progress,
+    warn: Warn = ignore_warnings,
+) -> Plan:
+    """The plan of a session's fitted planes, spheres and cylinders, and of the relations between them."""
+    with opened(session) as store:
+        measured = {each.id: each for each in load_measurements(store)}
+        fits = {each.id: each for each in measured.values() if each.kind in FITTED and not each.stale}
+        features = {identity: load_feature(store, each)[0] for identity, each in fits.items()}
+    if not fits:
+        raise InputError("nothing was fitted in this session: fit planes, spheres or cylinders to a scan first")
+    if len(sources := {each.source for each in fits.values()}) > 1:
+        last = list(fits.values())[-1].source
+        warn(f"measurements were made on {', '.join(sorted(sources))}: the plan takes those on {last} alone")
+        fits = {identity: each for identity, each in fits.items() if each.source == last}
+    T = np.eye(4)
+    if datums:
+        if missing := [each for each in datums if each not in fits]:
+            raise InputError(f"{', '.join(missing)} is no fit to align by: there are {', '.join(fits)}")
+        T = datum_frame([features[each] for each in datums])
+    elif nominal is not None:
+        ideal, source = read_nominal(nominal), next(iter(fits.values()))
+        surface = load_surface(session, source.source, model=source.model, progress=progress, warn=warn)
+        T = fit_to_nominal(surface, ideal).T_nominal_scan
+    names = _distinct_names(fits)
+    listed = [_plan_feature(names[i], each, features[i], T) for i, each in fits.items()]
+    characteristics: list[Characteristic] = []
+    for i, each in fits.items():
+        for quantity in quantities_of(each):
+            if quantity.name == "diameter":
+                characteristics.append(_around(f"{names[i]} diameter", quantity, (names[i],), tolerance))
+        kind = FORM_OF[each.kind]
+        characteristics.append(Characteristic(f"{names[i]} {kind}", kind, (names[i],), upper=tolerance))
+    for each in measured.values():
+        if each.kind == "relation" and not each.stale and all(i in fits for i in each.of):
+            pair = tuple(names[i] for i in each.of)
+            for quantity in quantities_of(each):
+                if quantity.name in KINDS:
+                    title = f"{pair[0]} – {pair[1]} {quantity.name}"
+                    characteristics.append(_around(title, quantity, pair, tolerance))
+    left_out = [each.name for each in measured.values() if each.kind not in (*FITTED, "relation") or each.stale]
+    if left_out:
+        warn(f"a plan holds fits and their relations that are not stale: {', '.join(left_out)} are not in it")
+    alignment = Alignment()
+    if datums:
+        start = tuple(tuple(row) for row in T.round(9).tolist())
+        alignment = Alignment("3-2-1", None, tuple(names[each] for each in datums), start)  # type: ignore[arg-type]
+    elif nominal is not None:
+        alignment = Alignment("best fit", str(nominal.expanduser().absolute()))
+    return Plan(name, tuple(listed), tuple(characteristics), alignment)
+
+
+def _around(name: str, quantity: Quantity, features: tuple[str, ...], tolerance: float) -> Characteristic:
+    """A characteristic with a tolerance around its measured value."""
+    nominal = round(quantity.value, 4)
+    lower, upper = round(nominal - tolerance, 4), round(nominal + tolerance, 4)
+    return Characteristic(name, quantity.name, features, nominal, lower, upper, quantity.unit)
+
+
+def _plan_feature(name: str, measured: Measurement, feature: Feature, T: np.ndarray) -> PlanFeature:
+    """A fitted feature with its region, in part coordinates."""
+    region = PlanRegion.of(from_plain(measured.data["region"], Region), T)
+    place = tuple((T[:3, :3] @ feature.place + T[:3, 3]).round(6).tolist())
+    direction = None if feature.direction is None else tuple((T[:3, :3] @ feature.direction).round(9).tolist())
+    return PlanFeature(name, feature.kind, region, place, direction, feature.radius)  # type: ignore[arg-type]
+
+
+def _distinct_names(fits: Mapping[str, Measurement]) -> dict[str, str]:
+    """The measurements' names by id, with the id where two have the same."""
+    names = [each.name for each in fits.values()]
+    return {i: each.name if names.count(each.name) == 1 else f"{each.name} {i}" for i, each in fits.items()}

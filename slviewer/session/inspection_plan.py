@@ -1,0 +1,200 @@
+"""An inspection plan as a TOML file: how a part is aligned, its features, and the characteristics with their limits."""
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from slviewer.errors import InputError
+from slviewer.inspection.features import Feature
+from slviewer.inspection.quantities import Unit
+from slviewer.inspection.regions import Region
+from slviewer.inspection.relations import MEANINGS
+from slviewer.records import from_plain, to_plain
+from slviewer.session.atomic import replace_file
+from slviewer.session.reading import read_toml
+from slviewer.session.toml import table_lines
+
+VERSION = 1
+SIZES = ("radius", "diameter")
+FORMS = ("flatness", "roundness", "cylindricity")
+TO_DATUM = ("parallelism", "perpendicularity")
+RELATIONS = tuple(dict.fromkeys(meaning.name for each in MEANINGS.values() for meaning in each))
+KINDS: dict[str, int] = {
+    **dict.fromkeys((*SIZES, *FORMS, "position", "profile"), 1),
+    **dict.fromkeys((*TO_DATUM, *RELATIONS), 2),
+}
+"""The number of features that each kind of characteristic takes; the second is the datum."""
+Vector = tuple[float, float, float]
+Row = tuple[float, float, float, float]
+
+
+@dataclass(frozen=True)
+class PlanRegion:
+    """A ball (``size``: radius) or a box (``size``: half sides) in part coordinates, mm; ``axes``: the directions of a
+    box's sides, where they are not the part's axes."""
+
+    kind: Literal["ball", "box"]
+    centre: Vector
+    size: tuple[float, ...]
+    axes: tuple[Vector, Vector, Vector] | None = None
+
+    def __post_init__(self) -> None:
+        wanted = 1 if self.kind == "ball" else 3
+        if len(self.size) != wanted or not all(0 < s < np.inf for s in self.size):
+            raise ValueError(f"a {self.kind} needs {wanted} sizes above 0 mm, not {list(self.size)}")
+
+    def within(self, points: np.ndarray) -> np.ndarray:
+        """(n,) bool: which points (n, 3) mm in part coordinates lie in it."""
+        local = points - np.array(self.centre)
+        if self.axes is not None:
+            local = local @ np.array(self.axes).T
+        return Region(self.kind, np.zeros(3), np.array(self.size)).within(local)
+
+    @classmethod
+    def of(cls, region: Region, T_part_scan: np.ndarray) -> "PlanRegion":
+        """The region of a scan in part coordinates."""
+        centre = T_part_scan[:3, :3] @ region.centre + T_part_scan[:3, 3]
+        turned = region.kind == "box" and not np.allclose(T_part_scan[:3, :3], np.eye(3))
+        x, y, z = (_vector(each, 9) for each in T_part_scan[:3, :3].T)
+        return cls(region.kind, _vector(centre), tuple(region.size.tolist()), (x, y, z) if turned else None)
+
+
+@dataclass(frozen=True)
+class PlanFeature:
+    """A feature to fit: its ``kind`` in a ``region``; ``place``, ``direction`` and ``radius``: nominal, in part
+    coordinates, for positions. A ``surface`` is compared with the nominal model."""
+
+    name: str
+    kind: Literal["plane", "sphere", "cylinder", "surface"]
+    region: PlanRegion
+    place: Vector | None = None
+    direction: Vector | None = None
+    radius: float | None = None
+
+    def nominal(self) -> Feature:
+        """The nominal feature. Raises InputError where the plan does not give it."""
+        if self.kind == "surface" or self.place is None or (self.kind != "sphere" and self.direction is None):
+            raise InputError(
+                f"The nominal of {self.name} is not known: give place, direction and radius of the feature in the plan."
+            )
+        direction = None
+        if self.direction is not None:
+            direction = np.array(self.direction) / np.linalg.norm(self.direction)
+        return Feature(self.kind, np.array(self.place), direction, self.radius)
+
+
+@dataclass(frozen=True)
+class Characteristic:
+    """What is measured and judged: its ``kind``, the names of its ``features`` (the second is the datum), ``nominal``
+    value and limits ``lower`` and ``upper`` in ``unit``, as absolute values, of which one or both may be absent."""
+
+    name: str
+    kind: str
+    features: tuple[str, ...]
+    nominal: float | None = None
+    lower: float | None = None
+    upper: float | None = None
+    unit: Unit = "mm"
+
+    def __post_init__(self) -> None:
+        if self.kind not in KINDS:
+            raise ValueError(f"there is no kind {self.kind!r}: choose one of {', '.join(KINDS)}")
+        if len(self.features) != KINDS[self.kind]:
+            raise ValueError(f"a {self.kind} takes {KINDS[self.kind]} features, not {len(self.features)}")
+        if self.lower is not None and self.upper is not None and not self.lower < self.upper:
+            raise ValueError(f"the lower limit {self.lower:g} of {self.name} is not below the upper {self.upper:g}")
+        if self.unit != ("deg" if self.kind == "angle" else "mm"):
+            raise ValueError(f"a {self.kind} is not measured in {self.unit!r}")
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """From scans to part coordinates: "none" (parts lie in a fixture), "best fit" to the ``nominal`` model, or "3-2-1"
+    by three ``datums``, features' names, which are looked for from ``start``, T_part_scan (4, 4) of the plan's scan."""
+
+    kind: Literal["none", "best fit", "3-2-1"] = "none"
+    nominal: str | None = None
+    datums: tuple[str, ...] = ()
+    start: tuple[Row, Row, Row, Row] | None = None
+
+    def __post_init__(self) -> None:
+        if (self.kind == "best fit") != (self.nominal is not None):
+            raise ValueError("a best fit needs the file of its nominal model, and other alignments take none")
+        if (self.kind == "3-2-1") != (self.start is not None):
+            raise ValueError("3-2-1 needs the pose of the plan's own scan as start, and other alignments take none")
+        if len(self.datums) != (3 if self.kind == "3-2-1" else 0):
+            raise ValueError("3-2-1 takes three datums, and other alignments take none")
+
+
+@dataclass(frozen=True)
+class Plan:
+    """An inspection plan."""
+
+    name: str
+    feature: tuple[PlanFeature, ...]
+    characteristic: tuple[Characteristic, ...]
+    alignment: Alignment = field(default_factory=Alignment)
+    version: int = VERSION
+
+    def __post_init__(self) -> None:
+        if self.version != VERSION:
+            raise ValueError(f"the plan has version {self.version}, and this program reads {VERSION}")
+        for what, listed in (("feature", self.feature), ("characteristic", self.characteristic)):
+            names = [each.name for each in listed]
+            if not names or len(set(names)) < len(names):
+                raise ValueError(f"each {what} needs a name of its own, and there must be one: {', '.join(names)}")
+        known = {each.name for each in self.feature}
+        asked = {name for each in self.characteristic for name in each.features} | set(self.alignment.datums)
+        if unknown := sorted(asked - known):
+            raise ValueError(f"there is no feature {', '.join(unknown)}: there are {', '.join(sorted(known))}")
+
+
+def read_plan(path: Path | str) -> Plan:
+    """The plan in a TOML file; a relative path of its nominal model refers to the file's folder. Raises InputError that
+    names what does not fit."""
+    data = read_toml(path)
+    unknown = [key for key in data if key not in Plan.__dataclass_fields__]
+    if unknown:
+        raise InputError(f"{path}: a plan has no {', '.join(unknown)}: remove it, or correct its name")
+    try:
+        plan = from_plain(data, Plan)
+    except InputError as error:
+        raise InputError(f"{path} is no inspection plan ({error}): correct it there") from error
+    if plan.alignment.nominal is None:
+        return plan
+    nominal = Path(path).expanduser().absolute().parent / plan.alignment.nominal
+    return replace(plan, alignment=replace(plan.alignment, nominal=str(nominal)))
+
+
+def write_plan(plan: Plan, path: Path | str) -> None:
+    """Write the plan as TOML."""
+    replace_file(Path(path).expanduser().absolute(), plan_toml(plan).encode())
+
+
+def plan_toml(plan: Plan) -> str:
+    """The TOML text of a plan."""
+    lines = [
+        "# Inspection plan of slviewer; lengths in mm, angles in degrees, places in part coordinates.",
+        "# Limits are absolute values; leave one out where there is none.",
+        *table_lines({"version": plan.version, "name": plan.name}),
+        "",
+        "[alignment]",
+        *table_lines(_entries(plan.alignment)),
+    ]
+    for title, listed in (("feature", plan.feature), ("characteristic", plan.characteristic)):
+        for each in listed:
+            lines += ["", f"[[{title}]]", *table_lines(_entries(each))]
+    return "\n".join(lines) + "\n"
+
+
+def _entries(record: Any) -> dict[str, Any]:
+    """The fields of a record that hold something."""
+    return {key: value for key, value in to_plain(record).items() if value not in (None, (), [])}
+
+
+def _vector(values: np.ndarray, digits: int = 6) -> Vector:
+    """Three coordinates (3,) as a tuple of rounded numbers."""
+    x, y, z = (round(float(value), digits) for value in values)
+    return x, y, z

@@ -1,0 +1,151 @@
+"""A plan on synthesised parts: those out of tolerance are found, and no others."""
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from slviewer.errors import InputError
+from slviewer.evaluation.capability import process_capability
+from slviewer.geometry.rigid import move_points, transform_from_rvec
+from slviewer.pipeline.inspect_parts import inspect_surfaces, write_inspection
+from slviewer.pipeline.measured_surface import MeasuredSurface
+from slviewer.session.inspection_plan import (
+    Alignment,
+    Characteristic,
+    Plan,
+    PlanFeature,
+    PlanRegion,
+    plan_toml,
+    read_plan,
+    write_plan,
+)
+
+NOISE, SIGMA, TOLERANCE = 0.01, 0.01, 0.06
+POSE = transform_from_rvec([2.9, 0.1, 0.2], [5.0, -3.0, 500.0])
+"""Of the part in the camera's frame: it is seen from above."""
+
+CORNER = transform_from_rvec([0.0, 0.0, 0.0], [40.0, 40.0, 0.0])
+
+
+def synthesised_part(seed: int, diameter: float = 20.0, motion: np.ndarray | None = None) -> MeasuredSurface:
+    """A table (z = 0, x and y from -40 to 40) with two side walls and a sphere on it, centred at 0, 0, 10."""
+    rng = np.random.default_rng(seed)
+    n = 2500
+    flat = np.stack([*rng.uniform(-40, 40, (2, n)), np.zeros(n)], 1)
+    flat = flat[np.linalg.norm(flat[:, :2], axis=1) > 15]
+    wall_x = np.stack([np.full(n, -40.0), rng.uniform(-40, 40, n), rng.uniform(1, 20, n)], 1)
+    wall_y = wall_x[:, [1, 0, 2]]
+    c, t = rng.uniform(0.2, 1, n), rng.uniform(0, 2 * np.pi, n)
+    q = np.sqrt(1 - c * c)
+    out = np.stack([q * np.cos(t), q * np.sin(t), c], 1)
+    flat[:, 2] += NOISE * rng.normal(size=len(flat))
+    wall_x[:, 0] += NOISE * rng.normal(size=n)
+    wall_y[:, 1] += NOISE * rng.normal(size=n)
+    ball = (diameter / 2 + NOISE * rng.normal(size=(n, 1))) * out + [0, 0, 10]
+    points = np.concatenate([flat, wall_x, wall_y, ball])
+    points = move_points(POSE if motion is None else motion @ POSE, points).astype(np.float32)
+    return MeasuredSurface(points, np.full(len(points), NOISE, np.float32), f"part {seed}", "splined", {})
+
+
+def make_plan(limit: float = TOLERANCE) -> Plan:
+    def box(low: tuple[float, ...], high: tuple[float, ...]) -> PlanRegion:
+        a, b = np.array(low), np.array(high)
+        return PlanRegion("box", tuple((a + b) / 2), tuple((b - a) / 2))
+
+    features = (
+        PlanFeature("table", "plane", box((56, 2, -3), (78, 78, 3)), (67.0, 40.0, 0.0), (0.0, 0.0, 1.0)),
+        PlanFeature("left", "plane", box((-3, 2, 3), (3, 78, 18)), (0.0, 40.0, 10.0), (1.0, 0.0, 0.0)),
+        PlanFeature("front", "plane", box((2, -3, 3), (78, 3, 18)), (40.0, 0.0, 10.0), (0.0, 1.0, 0.0)),
+        PlanFeature("ball", "sphere", PlanRegion("ball", (40.0, 40.0, 10.0), (12.0,)), (40.0, 40.0, 10.0), None, 10.0),
+        PlanFeature("nothing", "plane", PlanRegion("ball", (0.0, 0.0, 300.0), (5.0,))),
+    )
+    characteristics = (
+        Characteristic("diameter", "diameter", ("ball",), 20.0, 20.0 - limit, 20.0 + limit),
+        Characteristic("height", "height of the centre", ("table", "ball"), 10.0, 9.95, 10.05),
+        Characteristic("flatness", "flatness", ("table",), upper=0.05),
+        Characteristic("square", "perpendicularity", ("left", "table"), upper=0.05),
+    )
+    start = CORNER @ np.linalg.inv(POSE)
+    alignment = Alignment("3-2-1", None, ("table", "left", "front"), tuple(map(tuple, start.tolist())))  # type: ignore[arg-type]
+    return Plan("ball on a table", features, characteristics, alignment)
+
+
+def test_a_plan_survives_its_file(tmp_path: Path) -> None:
+    plan = make_plan()
+    write_plan(plan, tmp_path / "plan.toml")
+    again = read_plan(tmp_path / "plan.toml")
+    assert plan_toml(read_plan(tmp_path / "plan.toml")) == (tmp_path / "plan.toml").read_text()
+    assert again.characteristic == plan.characteristic
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "named"),
+    [
+        ("version = 1", "version = 9", "version 9"),
+        ('kind = "flatness"', 'kind = "flatnes"', "flatnes"),
+        ('features = ["ball"]', 'features = ["bal"]', "bal"),
+        ("lower = 9.95", "lower = 19.95", "19.95"),
+        ('name = "ball on a table"', "tolerances = 1", "tolerances"),
+    ],
+)
+def test_a_wrong_plan_is_refused_by_name(tmp_path: Path, old: str, new: str, named: str) -> None:
+    text = plan_toml(make_plan())
+    assert old in text
+    (tmp_path / "plan.toml").write_text(text.replace(old, new, 1))
+    with pytest.raises(InputError, match=named):
+        read_plan(tmp_path / "plan.toml")
+
+
+def test_of_20_parts_exactly_the_4_out_of_tolerance_fail(tmp_path: Path) -> None:
+    rng = np.random.default_rng(7)
+    wrong = {3: 1, 8: -1, 13: 1, 17: -1}
+    sources = []
+    for k in range(20):
+        off = wrong[k] * (TOLERANCE + 3 * SIGMA) if k in wrong else np.clip(SIGMA * rng.normal(), -0.04, 0.04)
+        # parts lie a little differently each time
+        motion = transform_from_rvec(0.001 * rng.normal(size=3), 0.3 * rng.normal(size=3))
+        sources.append((f"part {k}", lambda report, k=k, off=off, m=motion: synthesised_part(k, 20 + off, m)))
+    inspection = inspect_surfaces(make_plan(), sources)
+    assert inspection.parts_that("fail") == [f"part {k}" for k in wrong]
+    assert len(inspection.parts_that("pass")) == 16
+    assert "4 fail" in inspection.failure
+    values = np.array([each.results[1].value for each in inspection.parts])
+    assert 0 < np.abs(values - 10).max() < 0.01
+    capability = inspection.capabilities()[0]
+    assert capability is not None and capability.cp is not None
+    assert capability.cpk[1] < capability.cpk[0] <= capability.cp[0] < 1
+    written = write_inspection(inspection, tmp_path)
+    page, table, _ = (path.read_text("utf-8-sig") for path in written.files)
+    assert page.count("data:image/webp") == 4 and "http://" not in page and "part 17" in page
+    rows = list(csv.DictReader(table.splitlines()))
+    assert len(rows) == 80
+    assert [row["part"] for row in rows if row["decision"] == "fail"] == [f"part {k}" for k in wrong]
+
+
+def test_what_cannot_be_measured_is_named_and_takes_nothing_with_it(tmp_path: Path) -> None:
+    plan = make_plan()
+    missing = Characteristic("missing", "flatness", ("nothing",), upper=0.1)
+    plan = Plan(plan.name, plan.feature, (*plan.characteristic, missing), plan.alignment)
+
+    def broken(report: object) -> MeasuredSurface:
+        raise InputError("no such scan")
+
+    inspection = inspect_surfaces(plan, [("good", lambda report: synthesised_part(1)), ("broken", broken)])
+    good, bad = inspection.parts
+    assert [each.decision for each in good.results] == ["pass"] * 4 + ["undecided"]
+    assert "0 measured points" in good.results[-1].reason
+    assert all(each.reason == "no such scan" for each in bad.results)
+    assert "missing" in inspection.text() and "no such scan" in inspection.text()
+    assert "not measured" in write_inspection(inspection, tmp_path).files[0].read_text()
+
+
+def test_capability_of_known_spread() -> None:
+    values = 10 + 0.1 * np.random.default_rng(0).normal(size=400)
+    c = process_capability(values.tolist(), 9.5, 10.4)
+    assert c is not None and c.cp is not None
+    assert c.cp[1] < 1.5 < c.cp[2] and c.cpk[1] < 4 / 3 < c.cpk[2]
+    assert 0.9 * 1.5 < c.cp[0] < 1.1 * 1.5
+    assert process_capability([1.0, 1.0, 1.0], 0.0, 2.0) is None
+    assert process_capability([1.0, 2.0], 0.0, 2.0) is None
