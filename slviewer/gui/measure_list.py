@@ -19,7 +19,7 @@ from slviewer.inspection.section import CutPlane
 from slviewer.pipeline.measurements import section_lines
 from slviewer.report.measurements import section_plot
 from slviewer.session.measurements import Measurement, measurement_arrays
-from slviewer.wizard.measure_requests import TABLE
+from slviewer.wizard.measure_requests import PLAN, TABLE
 from slviewer.wizard.snapshot import SessionView
 
 CHOSEN, OTHER, STALE = (200, 40, 40), (30, 90, 160), (140, 140, 140)
@@ -61,6 +61,9 @@ class MeasurementList:
         with gui.add_folder("All results", visible=False) as self._table_folder:
             self._table = Text(gui)
             context.button("Write CSV", operator.export_measurements_table, viser.Icon.TABLE_EXPORT)
+            context.button(
+                "Make plan", operator.make_inspection_plan, viser.Icon.REPEAT, hint="To repeat the fits on other scans"
+            )
             self._file = Text(gui)
 
     @property
@@ -94,8 +97,10 @@ class MeasurementList:
         for folder in (self._chosen_folder, self._table_folder):
             change(folder, visible=bool(measured))
         change(self._restore, visible=bool(session and session.deleted_measurements))
-        file = next((each for each in session.exports if each.name == TABLE), None) if session else None
-        self._file.set("" if file is None else paragraph(link(self._context.offer(file.path), f"Download {TABLE}")))
+        files = [each for each in session.exports if each.name in (TABLE, PLAN)] if session else []
+        self._file.set(
+            "".join(paragraph(link(self._context.offer(each.path), f"Download {each.name}")) for each in files)
+        )
         self.refresh()
         return new
 

@@ -11,17 +11,19 @@ from slviewer.validation.prove_causes import prove_causes
 from slviewer.validation.prove_edges import prove_edges
 from slviewer.validation.prove_guidance import prove_guidance
 from slviewer.validation.prove_hostile import prove_hostile
+from slviewer.validation.prove_plan import prove_plan
 from slviewer.validation.prove_registration import prove_registration
 from slviewer.validation.prove_surfaces import prove_surfaces
 from slviewer.validation.prove_uncertainty import prove_uncertainty
 
-Claim = Literal["accuracy", "causes", "edges", "guidance", "hostile", "registration", "surfaces", "uncertainty"]
+Claim = Literal["accuracy", "causes", "edges", "guidance", "hostile", "plan", "registration", "surfaces", "uncertainty"]
 CLAIMS: Mapping[Claim, tuple[str, Callable[..., Proof]]] = {
     "accuracy": ("accuracy at the noise floor", prove_accuracy),
     "causes": ("faults called by their names", prove_causes),
     "edges": ("printed edges without ridges", prove_edges),
     "guidance": ("guided poses", prove_guidance),
     "hostile": ("captures of a hostile rig", prove_hostile),
+    "plan": ("tolerances of an inspection plan", prove_plan),
     "registration": ("scans in one frame", prove_registration),
     "surfaces": ("surfaces that light themselves", prove_surfaces),
     "uncertainty": ("predicted uncertainty", prove_uncertainty),
@@ -71,8 +73,8 @@ def prove(
     Args:
         quick: A quarter of the camera's resolution; its figures are its own.
         only: What to prove: accuracy on planes and spheres, causes of bad calibrations, printed edges, guidance of an
-            operator to good poses, captures of a hostile rig, registration of scans, surfaces that light themselves,
-            uncertainty against true errors; by default all.
+            operator to good poses, captures of a hostile rig, tolerances of an inspection plan, registration of scans,
+            surfaces that light themselves, uncertainty against true errors; by default all.
         cases: Of the hostile rig only these faults, such as flicker, jpeg:mild or gamma:severe:scan.
         seed: Another seed proves it on other rigs of the same kinds.
     """

@@ -12,7 +12,9 @@ from slviewer.inspection.tolerance import DECIDED
 from slviewer.pipeline import measurements
 from slviewer.pipeline.compare import NominalComparison, compare_surface
 from slviewer.pipeline.measured_surface import MeasuredSurface
+from slviewer.pipeline.plan import TOLERANCE_MM, make_plan
 from slviewer.session import atomic
+from slviewer.session.inspection_plan import write_plan
 from slviewer.session.measurements import Measurement
 from slviewer.session.names import safe_name
 from slviewer.session.nominal import Units, read_nominal
@@ -23,7 +25,7 @@ from slviewer.wizard.requests import RequestHandler, request
 from slviewer.wizard.surfaces import NOMINALS, Surfaces
 
 P = ParamSpec("P")
-TABLE = "measurements.csv"
+TABLE, PLAN = "measurements.csv", "plan.toml"
 MEASURING, COMPARING = "Measuring", "Comparing with the nominal model"
 
 
@@ -146,6 +148,24 @@ class MeasureRequests(RequestHandler):
             return f"{TABLE} is ready to download: {count} measurement{'s' * (count != 1)}"
 
         self._submit("Writing the table", work, str)
+
+    @request("Making the plan")
+    def make_inspection_plan(self) -> None:
+        """Write an inspection plan of the fits and relations into the exports, to repeat them on other scans."""
+        store = self._engine.store
+
+        def work(report: Reporter) -> str:
+            """Write the plan into the exports; returns a sentence with what to do with it."""
+            made = make_plan(store, TOLERANCE_MM, name=store.folder.name, warn=self._warn)
+            with staged_export(store, PLAN, report) as path:
+                write_plan(made, path)
+            report(1.0, "written")
+            return (
+                f"{PLAN} is ready to download: {len(made.characteristic)} characteristics; set its limits, then run "
+                f"slviewer inspect-parts {PLAN} SESSION..."
+            )
+
+        self._submit("Making the plan", work, str)
 
 
 @contextmanager
