@@ -54,6 +54,7 @@ def test_all_claims_are_proved_and_one_that_fails_is_named(asked, tmp_path, caps
         "edges": True,
         "guidance": True,
         "hostile": True,
+        "plan": True,
         "registration": True,
         "surfaces": True,
         "uncertainty": True,
