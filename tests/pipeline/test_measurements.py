@@ -266,3 +266,27 @@ def test_a_merge_is_measured_on_too(folder, balls, regions) -> None:
     other = measurements.add_fit(folder, balls, "sphere", ball_about(balls, region))
     with pytest.raises(InputError, match="frame"):
         measurements.add_relation(folder, one.id, other.id)
+
+
+def test_measurements_are_repeated_by_a_plan(made: Path, run: Run, tmp_path: Path) -> None:
+    session = tmp_path / "parts" / "one"
+    shutil.copytree(made, session)
+    for centre in CENTRES:
+        x, y, z = centre - [0, 0, RADIUS]
+        assert run("measure", session, "balls", "sphere", "--ball", x, y, z, 15)[0] == 0
+    run("measurements", session, "--relate", "m1", "m2")
+    plan = tmp_path / "plan.toml"
+    status, text, _ = run("plan", session, "--out", plan, "--tolerance", 0.5)
+    assert status == 0 and "6 characteristics of 2 features" in text
+    results = tmp_path / "results"
+    status, text, _ = run("inspect-parts", plan, tmp_path / "parts", "--scan", "balls", "--out", results)
+    assert status == 0, text
+    data = json.loads((results / "parts.json").read_text())
+    assert [each["decision"] for each in data["parts"]] == ["pass"]
+    true = float(np.linalg.norm(CENTRES[1] - CENTRES[0]))
+    values = {each["name"]: each["value"] for each in data["parts"][0]["results"]}
+    apart = next(value for name, value in values.items() if name.endswith("distance of the centres"))
+    assert apart == pytest.approx(true, abs=0.1)
+    # the other scan shows no balls there: it is named, and the status says so
+    status, text, error = run("inspect-parts", plan, session, "--out", results)
+    assert status == 1 and "object" in error and "not measured" in text

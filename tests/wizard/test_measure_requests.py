@@ -21,6 +21,7 @@ from slviewer.pipeline.measurements import (
     quantities_of,
 )
 from slviewer.pipeline.models import save_imported_stereo
+from slviewer.session.inspection_plan import read_plan
 from slviewer.session.store import Session
 from slviewer.simulation.assets import asset
 from slviewer.simulation.boards import Pose
@@ -104,6 +105,9 @@ def test_what_is_clicked_is_measured_and_true(operator: Operator) -> None:
     made = next(each for each in now(operator).exports if each.name == "measurements.csv")
     rows = list(csv.DictReader(made.path.read_text("utf-8-sig").splitlines()))
     assert {row["name"] for row in rows} >= {"Width <b>", left.name}
+    assert operator.make_inspection_plan()
+    made = next(each for each in now(operator).exports if each.name == "plan.toml")
+    assert {each.kind for each in read_plan(made.path).characteristic} >= {"diameter", "distance of the centres"}
 
 
 def test_what_cannot_be_measured_is_said_and_nothing_kept(operator: Operator) -> None:
