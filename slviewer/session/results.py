@@ -8,6 +8,7 @@ import hashlib
 import io
 import math
 import os
+import tokenize
 from collections.abc import Collection, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -120,7 +121,7 @@ def read_arrays(folder: Path, only: Collection[str] | None = None) -> dict[str, 
             continue
         try:
             arrays[name] = _read_array(_array_path(folder, name))
-        except (OSError, ValueError, EOFError, KeyError, SyntaxError, MemoryError) as error:
+        except (OSError, ValueError, EOFError, KeyError, SyntaxError, tokenize.TokenError, MemoryError) as error:
             raise _damage(folder, f"array {name}: {error}") from error
         if name in checksums and _checksum(_make_header(arrays[name]), arrays[name]) != checksums[name]:
             raise _damage(folder, f"array {name} differs from its checksum")

@@ -201,3 +201,13 @@ def test_check_finds_damage_of_older_sessions(session, sequence, frames):
     damage_file(session.folder / "captures/a/frames.zarr/c/1/0/0", "one bit")
     with pytest.raises(SessionError, match=r"a: .*hash differs"):
         inspect(session.folder, check=True)
+
+
+def test_an_array_whose_header_ends_too_early_is_damaged(tmp_path: Path) -> None:
+    """NumPy's reader of old headers raises an error of the tokenizer there."""
+    with Session.create(tmp_path / "session") as store:
+        store.save_result("edits/one", {}, {"0": np.arange(5)})
+        file = tmp_path / "session/results/edits/one/arrays/0.npy"
+        file.write_bytes(file.read_bytes().replace(b"}", b"{", 1))
+        with pytest.raises(DamagedError, match="array 0"):
+            store.load_result("edits/one")
