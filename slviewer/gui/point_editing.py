@@ -106,6 +106,7 @@ class PointEditing:
                 self._forget_selection()
             elif self._selected is not None:
                 self._selected &= np.isfinite(cloud.points[..., 2])  # type: ignore[union-attr]
+                self._plane = None  # other points may lie below it now
             self._draw_selection()
             return self._shown_points()
 
