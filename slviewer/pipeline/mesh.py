@@ -14,7 +14,7 @@ from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_w
 from slviewer.pipeline.merge import Merge, StartKind, merge
 from slviewer.pipeline.models import ModelName, check_accepted, load_stereo, warn_if_stale
 from slviewer.pipeline.open_session import SessionLike, opened
-from slviewer.pipeline.scan_edits import refuse_region
+from slviewer.pipeline.scan_edits import OFF, refuse_region, resolve_region, restriction_notes
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.session.mesh_files import write_shape, write_textured
 from slviewer.session.store import Session
@@ -114,17 +114,20 @@ def mesh(
                 store, sources, sources[0], points, model=model, start=start, angle=angle,
                 roi=roi, accept_rejected=accept_rejected, progress=before, warn=warn,
             )  # fmt: skip
-            shape = merged.fused.surface
+            shape, restrictions = merged.fused.surface, merged.restrictions
         elif sources[0].startswith(MERGE):
             refuse_region(sources[0], roi)
-            shape = merged_points(store, sources[0].removeprefix(MERGE), warn)
+            name = merge_name(store, sources[0].removeprefix(MERGE))
+            shape = merged_points(store, name, warn)
+            restrictions = tuple(store.load_result(f"{MERGE}{name}", only=())[0].get("restrictions", ()))
         else:
             warn_if_stale(store, warn)
             shape = scan_cloud(store, sources[0], model, before, warn, accept_rejected, roi)
+            restrictions = restriction_notes(store, sources, resolve_region(store, roi))
         scans = {} if texture is None else _textured_scans(store, sources, shape, merged, model, warn, accept_rejected)
         light = None if texture is None else _projector_place(store)
     meshed = build_mesh(shape, plan, part(progress, 0.5, 0.95 if texture is None else 0.6))
-    notes = (f"of {', '.join(sources)}", *meshed.text().splitlines())
+    notes = (f"of {', '.join(sources)}", *restrictions, *meshed.text().splitlines())
     if texture is None:
         progress(0.95, f"writing {path.name}")
         write_shape(path, meshed.mesh, notes=notes)

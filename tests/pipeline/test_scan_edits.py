@@ -176,6 +176,8 @@ def test_the_report_and_the_files_list_region_and_edits(session: Path, cloud: np
     report(session, tmp_path / "after.html")
     page = (tmp_path / "after.html").read_text()
     assert "Region and edits" in page and edited.edits[0] in page and "1000.0 x 1000.0 x 1990.0 mm" in page + text
+    written = mesh(session, ["one"], tmp_path / "mesh.ply").out.read_bytes()[:3000]
+    assert edited.edits[0].encode() in written
     header = export(session, "cloud", "one").path.read_bytes()[:3000].split(b"end_header")[0].decode()
     assert edited.edits[0] in header and "1000.0 x 1000.0 x 1990.0 mm" in header
 
