@@ -14,7 +14,7 @@ from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_w
 from slviewer.pipeline.merge import Merge, StartKind, merge
 from slviewer.pipeline.models import ModelName, check_accepted, load_stereo, warn_if_stale
 from slviewer.pipeline.open_session import SessionLike, opened
-from slviewer.pipeline.scan_edits import OFF, refuse_region, resolve_region, restriction_notes
+from slviewer.pipeline.scan_edits import refuse_region, resolve_region, restriction_notes
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.session.mesh_files import write_shape, write_textured
 from slviewer.session.store import Session
