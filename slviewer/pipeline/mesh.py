@@ -14,7 +14,7 @@ from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_w
 from slviewer.pipeline.merge import Merge, StartKind, merge
 from slviewer.pipeline.models import ModelName, check_accepted, load_stereo, warn_if_stale
 from slviewer.pipeline.open_session import SessionLike, opened
-from slviewer.pipeline.scan_edits import refuse_region, resolve_region, restriction_notes
+from slviewer.pipeline.scan_edits import OFF, refuse_region, resolve_region, restriction_notes
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.session.mesh_files import write_shape, write_textured
 from slviewer.session.store import Session
@@ -161,8 +161,8 @@ def _textured_scans(
     placed = {name: np.array(pair["T_reference_scan"], np.float64) for name, pair in meta["pairs"].items()}
     placed |= {meta["reference"]: np.eye(4)}
     used = meta.get("model") or model
-    return {
-        name: (scan_cloud(store, name, used, ignore_progress, warn, accept_rejected), placed[name])
+    return {  # what lies outside of the region still hides the surface from a scan
+        name: (scan_cloud(store, name, used, ignore_progress, warn, accept_rejected, OFF), placed[name])
         for name in meta["scans"]
     }
 
