@@ -56,7 +56,7 @@ def export_file(
             session, [source], path, plan=plan, texture=texture, accept_rejected=accepts, progress=progress, warn=warn
         )
         assert made.textured is not None
-        words = "; ".join([*made.meshed.text().splitlines(), made.textured.text()])
+        words = f"{made.meshed.text().splitlines()[0]}; {made.textured.text()}"
     report(1.0, "exported")
     return f"{path.name} is ready to download: {words}"
 
