@@ -30,7 +30,10 @@ ORIENTATION_KINDS: tuple[OrientationKind, ...] = get_args(OrientationKind)
 DEGREE = 6
 """Of the polynomials across a region that count as form; what is finer is noise or unresolved."""
 MAX_DRAWN_POINTS = 2_000
+MAX_EVEN_POINTS = 5_000
 SPIKE_SIGMA = 5.0
+DENSITY_REACH = 0.3
+"""Of the coordinates across a region, -1 to 1: within it the density of the points is estimated."""
 PATCH_SIGMA = 4.5
 """Of the mean of a patch: one that is farther off the smooth part shows form that is too fine for it."""
 SPAN_RATIO = 1e-3
@@ -48,8 +51,8 @@ MAX_TILT_DEG = 10.0
 class SmoothDeviations:
     """The smooth part of deviations (n,) mm at ``points`` (n, 3), along ``normals`` (n, 3).
 
-    ``basis`` (n, r) has orthonormal columns: the smooth part is ``basis @ weights``; ``noise_mm`` is one point's
-    standard deviation, ``unresolved_mm`` how far patches lie off the smooth part beyond noise; ``answer`` (r, m) gives
+    The smooth part is ``basis @ weights`` (n, r) and (r,); ``noise_mm`` is the standard deviation of one point, and of
+    each weight, ``unresolved_mm`` how far patches lie off the smooth part beyond noise; ``answer`` (r, m) gives
     the weights by displacements of the ``sampled`` points (m,) along their normals.
     """
 
@@ -103,8 +106,14 @@ def smooth_deviations(
     noise = float(np.sqrt(residuals @ residuals / (n - columns)))
     factor, unresolved = _patch_misfit(residuals, coordinates, noise, n, columns)
     sampled = np.arange(0, n, -(-n // MAX_SHARED_POINTS))
-    answer = np.linalg.pinv(whole[sampled], rcond=1e-6)[removed.shape[1] :]
-    return SmoothDeviations(points, normals, basis, basis.T @ d, factor * noise, unresolved, answer, sampled)
+    answer = np.linalg.pinv(whole[sampled], rcond=1e-6)
+    # the reference is that of even weight by area, whatever the density of the points
+    even = np.arange(0, n, -(-n // MAX_EVEN_POINTS))
+    near = cKDTree(coordinates[even]).query_ball_point(coordinates[even], DENSITY_REACH, return_length=True)
+    root = 1 / np.sqrt(near)[:, None]
+    reference = np.linalg.lstsq(root * removed[even], root * whole[even], rcond=1e-6)[0]
+    smooth = whole - removed @ reference
+    return SmoothDeviations(points, normals, smooth, whole.T @ d, factor * noise, unresolved, answer, sampled)
 
 
 def zone_width(
@@ -159,10 +168,12 @@ def form_error(kind: FormKind, fit: FeatureFit, points: np.ndarray, shared: Shar
         normals = f.normals(points)
         across = normals - (normals @ axis)[:, None] * axis
         coordinates = across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-12)
+        fitted = np.column_stack([coordinates, np.ones(len(points))])  # a circle: a thin section shows no tilt
     else:
         normals = f.normals(points)
         coordinates = _region_coordinates(points) if f.kind == "plane" else _cylinder_coordinates(f, points)
-    smooth = smooth_deviations(f.distance(points), points, normals, coordinates, f.jacobian(points))
+        fitted = f.jacobian(points)
+    smooth = smooth_deviations(f.distance(points), points, normals, coordinates, fitted)
     return zone_width(kind, smooth, lambda d: np.ptp(d, axis=0), shared)
 
 

@@ -31,12 +31,12 @@ def write_parts_page(
         Headline(str(len(parts)), "parts"),
         *(Headline(str(count), decision, "", _headline_mark(decision, count)) for decision, count in counts.items()),
     ]
-    reasons = [
-        PageNotice(f"{each.part}, {result.name}: not measured: {result.reason}")
-        for each in parts
-        for result in each.results
-        if result.reason
-    ]
+    unmeasured: dict[tuple[str, str], list[str]] = {}
+    for each in parts:
+        for result in each.results:
+            if result.reason:
+                unmeasured.setdefault((result.name, result.reason), []).append(each.part)
+    reasons = [PageNotice(f"{name}: {why} ({', '.join(named)})") for (name, why), named in unmeasured.items()]
     whole = all(result.whole for each in parts for result in each.results)
     partial = [] if whole else ["Some U hold no part of the calibration's uncertainty: the model does not predict it."]
     charts = [
