@@ -291,7 +291,9 @@ def test_a_part_is_measured_and_compared_with_its_nominal(
 
     button(page, "Delete result").click()
     button(page, "Restore deleted").click()
+    expect(button(page, "Restore deleted")).to_be_hidden()
     came(operator, 4)
+    operator.wait_until_idle(60)
     button(page, "Write CSV").click()
     with page.expect_download() as download:
         page.get_by_text("Download measurements.csv").click(timeout=40_000)
