@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 from contextlib import suppress
+from typing import Any
 
 MEMORY_BYTES = 2 << 30
 _PATIENCE_S = 60
@@ -17,10 +18,11 @@ def run_isolated(module: str, *arguments: str, data: bytes = b"", cpu_s: int = 1
     """
     paths = os.pathsep.join(filter(None, sys.path))
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": paths, "SLVIEWER_CPU_S": str(cpu_s)}
+    sent: dict[str, Any] = {"input": data} if data else {"stdin": subprocess.DEVNULL}
     try:
         ran = subprocess.run(
             [sys.executable, "-m", module, *arguments],
-            input=data,
+            **sent,
             capture_output=True,
             timeout=_PATIENCE_S + cpu_s,
             env=environment,
