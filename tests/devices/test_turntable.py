@@ -85,7 +85,11 @@ def broken(dialect: Any, fault: Fault) -> str:
         with pytest.raises(TurntableError) as raised:
             table.turn_to(60.0)
         if fault in ("stuck", "alarm"):  # it does not turn on unattended, and nothing unlocks it
-            assert ("cancel" if dialect == "grbl" else "M410") in controller.received
+            stop = "cancel" if dialect == "grbl" else "M410"
+            deadline = time.monotonic() + 10.0  # the controller may read it after the driver has given up
+            while stop not in controller.received and time.monotonic() < deadline:
+                time.sleep(0.01)
+            assert stop in controller.received
         assert not any("$X" in line for line in controller.received)
         table.close()
     return str(raised.value)
