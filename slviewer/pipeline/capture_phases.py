@@ -35,7 +35,7 @@ _REASONS = {
     ),
     Reason.INDIRECT: (
         "receive much light from other surfaces or through the material",
-        "use the patterns micro, and see docs/difficult-surfaces.md",
+        "use the patterns micro, and see docs/howto/difficult-surfaces.md",
     ),
     Reason.OUTSIDE: ("lie outside the projector", "check the size of the projector and the periods"),
 }
