@@ -16,12 +16,12 @@ from slviewer.simulation.mesh import MeshScene, demo_object
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import SimulatedRig
 from slviewer.simulation.scenes import Scene, Spheres, sphere
-from slviewer.simulation.turning import turn_pose, turning
+from slviewer.simulation.turning import stone_on_table, turn_pose, turning
 from slviewer.target.board import Board
 
-Thing = Literal["board", "plane", "sphere", "object", "stone", "marked", "groove", "bowl", "wax"]
-"""The printed target, the blank plate, the Letter's sphere, the demo object, the stone on the turntable, a plate with
-coded markers, and three surfaces that light themselves."""
+Thing = Literal["board", "plane", "sphere", "object", "stone", "stone on a table", "marked", "groove", "bowl", "wax"]
+"""The printed target, the blank plate, the Letter's sphere, the demo object, the stone of the turntable, alone and on
+a table, a plate with coded markers, and three surfaces that light themselves."""
 
 _INITIAL_DEPTHS_MM = {"board": 600.0, "plane": 600.0, "sphere": 690.0, "object": 600.0, "marked": 600.0}
 _INITIAL_DEPTHS_MM |= dict.fromkeys(CONCAVE, 640.0)
@@ -192,7 +192,9 @@ def _make_scene(thing: Thing) -> Scene:
         return marked_plate(_make_initial_pose(thing))
     if thing in CONCAVE:
         return CONCAVE[thing](_make_initial_pose(thing))
-    return demo_object(_make_initial_pose(thing)) if thing == "object" else turning(1)["turn_01"]
+    if thing == "object":
+        return demo_object(_make_initial_pose(thing))
+    return stone_on_table() if thing == "stone on a table" else turning(1)["turn_01"]
 
 
 def _make_initial_pose(thing: Thing) -> Pose:

@@ -10,21 +10,22 @@ from slviewer.errors import InputError
 from slviewer.gui.inputs import change
 from slviewer.gui.panel import PanelContext
 from slviewer.gui.widgets import Text, coloured, paragraph
+from slviewer.pipeline.edit import SUPPORT
 from slviewer.surface.selection import (
     SupportPlane,
     ViewCamera,
-    detect_support,
     select_connected,
     select_in_outline,
+    select_support,
 )
 from slviewer.wizard.result_views import ScanCloud, nearest
 from slviewer.wizard.snapshot import ScanView
 
-OFF, RECTANGLE, POLYGON, PART = "off", "rectangle", "polygon", "connected part"
+OFF, RECTANGLE, LASSO, PART = "off", "rectangle", "lasso", "connected part"
 _HINTS = {
     OFF: "",
     RECTANGLE: "Drag a rectangle over the points. To turn the view, choose “off”.",
-    POLYGON: "Click the corners of an outline, then Close outline.",
+    LASSO: "Click around the points, then Close outline.",
     PART: "Click a part of the surface.",
 }
 SELECTED = (225, 40, 120)
@@ -59,7 +60,7 @@ class PointEditing:
         self._visible = False
         gui, operator = context.gui, context.operator
         with gui.add_folder("Edit points", expand_by_default=False):
-            self._mode = gui.add_dropdown("Select by", (OFF, RECTANGLE, POLYGON, PART))
+            self._mode = gui.add_dropdown("Select by", (OFF, RECTANGLE, LASSO, PART))
             self._hint = Text(gui)
             self._close = context.button("Close outline", self._close_outline, viser.Icon.POLYGON, None, visible=False)
             context.button(
@@ -189,7 +190,7 @@ class PointEditing:
         scene, mode = self._context.scene, self._mode.value
         rectangles = self._visible and mode == RECTANGLE
         scene.on_rectangle(self._take_rectangle if rectangles else None)
-        if mode == POLYGON:
+        if mode == LASSO:
             scene.on_view_click(self._take_corner if self._visible else None)
         else:
             scene.on_pick(None if rectangles or not self._visible else self._take_click)
@@ -240,7 +241,7 @@ class PointEditing:
                 return
             mask = select_in_outline(points, self._view, self._corners)
             self._forget_outline()
-            self._add(mask, POLYGON)
+            self._add(mask, LASSO)
 
     # the buttons
 
@@ -255,8 +256,8 @@ class PointEditing:
         with self._lock:
             cloud, points = self._require_cloud(), self._shown_points()
             assert points is not None
-            plane = detect_support(points, float(np.nanmedian(cloud.sigma_z)))
-            self._add(plane.select_below(points), "support and below", plane)
+            plane, selected = select_support(points, cloud.sigma_z)
+            self._add(selected, SUPPORT, plane)
 
     def _invert(self) -> None:
         """Select what was not selected, of the points that are shown."""

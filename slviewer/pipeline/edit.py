@@ -16,7 +16,10 @@ from slviewer.session.scan_edits import list_edits, load_edits, load_region, sav
 from slviewer.session.store import Session
 from slviewer.surface.point_edits import make_edit
 from slviewer.surface.region_of_interest import RegionOfInterest
-from slviewer.surface.selection import SupportPlane, detect_support, select_connected, select_polygon
+from slviewer.surface.selection import SupportPlane, select_connected, select_polygon, select_support
+
+SUPPORT = "support and below"
+"""How the points of a support are said to be selected."""
 
 
 @dataclass(frozen=True)
@@ -93,8 +96,7 @@ def edit_scan(
         cloud = scan_cloud(store, scan, model, progress, warn, accept_rejected)
         plane = None
         if support:
-            plane = detect_support(cloud.points, float(np.nanmedian(cloud.sigma_z)), margin)
-            selected, what = plane.select_below(cloud.points), "support and below"
+            (plane, selected), what = select_support(cloud.points, cloud.sigma_z, margin), SUPPORT
         elif part:
             if len(part) != 2:
                 raise UsageError(f"--part has {len(part)} numbers: give u v of one pixel, such as --part 180 150")

@@ -20,6 +20,8 @@ AXIS /= np.linalg.norm(AXIS)
 _AXIS_OFFSET_MM = np.array([6.0, -4.0, 0.0])  # the object does not stand in the table's middle
 
 _RADIUS_MM, _FOOT_MM = 56.0, 27.0
+_TABLE_MM = 130.0
+"""From the object to the edges of a square table."""
 _SUBDIVISIONS = 7  # edges of about half a millimetre
 
 
@@ -39,6 +41,17 @@ def turn_pose(pose: Pose, deg: float) -> Pose:
     """Return a pose on the table after it was turned by an angle."""
     R = rotation(np.radians(deg) * AXIS)
     return Pose(R @ pose.R, AXIS_POINT + R @ (pose.t - AXIS_POINT))
+
+
+def stone_on_table() -> MeshScene:
+    """The stone as it is first on the turntable, and a square table below its foot that the camera sees around it."""
+    scene = turning(1)["turn_01"]
+    a, n = _TABLE_MM, len(scene.vertices)
+    corners = np.array([(-a, -a, -_FOOT_MM), (a, -a, -_FOOT_MM), (a, a, -_FOOT_MM), (-a, a, -_FOOT_MM)])
+    table = np.array([(0, 1, 2), (0, 2, 3)], np.int32)
+    return MeshScene(
+        np.concatenate([scene.vertices, corners]), np.concatenate([scene.triangles, n + table]), scene.pose
+    )
 
 
 @lru_cache(1)

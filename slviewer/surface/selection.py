@@ -150,3 +150,12 @@ def detect_support(points: np.ndarray, sigma_mm: float, margin_mm: float | None 
     scatter = 3 * 1.4826 * float(np.median(np.abs(residuals)))
     margin = max(scatter, tolerance) if margin_mm is None else margin_mm
     return SupportPlane((float(normal[0]), float(normal[1]), float(normal[2])), offset, margin)
+
+
+def select_support(
+    points: np.ndarray, sigma_z: np.ndarray, margin_mm: float | None = None
+) -> tuple[SupportPlane, Mask]:
+    """Detect the support of a cloud (h, w, 3) mm of the noise ``sigma_z`` (h, w) mm, as `detect_support` does; returns
+    it with the mask (h, w) of the points on it and below."""
+    plane = detect_support(points, float(np.nanmedian(sigma_z)), margin_mm)
+    return plane, plane.select_below(points)

@@ -1,5 +1,7 @@
 """Requests to set the region of interest, and to delete points of scans so that they can be brought back."""
 
+from functools import partial
+
 import numpy as np
 
 from slviewer.errors import InputError
@@ -7,6 +9,7 @@ from slviewer.pipeline.edit import change_history, delete_points
 from slviewer.session.scan_edits import load_region, save_region
 from slviewer.surface.region_of_interest import RegionOfInterest
 from slviewer.surface.selection import SupportPlane
+from slviewer.wizard import tasks
 from slviewer.wizard.requests import RequestHandler, request
 from slviewer.wizard.result_views import whole_cloud
 
@@ -41,6 +44,12 @@ class EditRequests(RequestHandler):
         """Delete the ``selected`` (h, w) of the points (h, w, 3) mm that are shown of a scan; `undo_edit` undoes it."""
         count = delete_points(self._engine.store, scan, points, selected, what, plane)
         self._engine.notices.add("info", f"{scan}: {count:,} points deleted; Undo brings them back")
+
+    @request("Removing the support")
+    def remove_support(self, *scans: str) -> None:
+        """Delete the plane that the object stands on, and all below it, from scans; `undo_edit` undoes it for each."""
+        remove = partial(tasks.remove_support, self._engine.store, list(scans), warn=self._warn)
+        self._submit("Removing the support", remove, tasks.describe_removal)
 
     @request("Undoing the edit")
     def undo_edit(self, scan: str) -> None:

@@ -16,12 +16,13 @@ from functools import partial
 
 import numpy as np
 
-from slviewer.errors import Cancelled, SlviewerError
+from slviewer.errors import Cancelled, InputError, SlviewerError
 from slviewer.evaluation.crossvalidation import CrossValidation
 from slviewer.evaluation.plane import PlaneResult
 from slviewer.evaluation.sphere import SphereResult
 from slviewer.pipeline.align import Placement, align_scan, list_scans, load_placement
 from slviewer.pipeline.calibrate import CalibrationResult, calibrate
+from slviewer.pipeline.edit import SUPPORT, delete_points
 from slviewer.pipeline.feedback import Warn
 from slviewer.pipeline.merge import Merge, Picked, StartKind, merge, merge_record
 from slviewer.pipeline.models import POSES_FOR_PIXELWISE, accepts_rejected, available_models, best_model
@@ -32,9 +33,12 @@ from slviewer.pipeline.turn import WATERTIGHT, align_turn
 from slviewer.pipeline.validate import validate
 from slviewer.pipeline.verify import Shape, verify
 from slviewer.reconstruction.cloud import Cloud
+from slviewer.session.scan_edits import load_edits
 from slviewer.session.store import Session
+from slviewer.surface.selection import select_support
 from slviewer.wizard.export_files import export_file, staged_export
 from slviewer.wizard.jobs import Reporter
+from slviewer.wizard.result_views import used_points, whole_cloud
 from slviewer.wizard.snapshot import Level
 
 
@@ -182,6 +186,38 @@ def place_scans(session: Session, names: list[str], report: Reporter, warn: Warn
         placements.append(align_scan(guarded, name, clouds=clouds, warn=warn))
     report(1.0, "aligned")
     return placements
+
+
+def remove_support(session: Session, names: list[str], report: Reporter, warn: Warn) -> dict[str, int]:
+    """Delete the plane that the object stands on, and all below it, from scans: {scan: points deleted}.
+
+    Scans without such a plane, and those that it was deleted from before, stay as they are, with a warning. InputError
+    where all of them do.
+    """
+    deleted, refused = dict[str, int](), list[str]()
+    for i, name in enumerate(names):
+        report(i / len(names), f"removing the support from {name}")
+        if any(edit.plane is not None for edit in load_edits(session, name).active):
+            refused.append(f"{name}: its support was removed before; Undo edit brings it back")
+            continue
+        try:
+            cloud = used_points(session, whole_cloud(session, name))
+            plane, selected = select_support(cloud.points, cloud.sigma_z)
+            deleted[name] = delete_points(session.guarded(report.saving), name, cloud.points, selected, SUPPORT, plane)
+        except InputError as error:
+            refused.append(f"{name}: {error}")
+    if not deleted:
+        raise InputError("; ".join(refused) or "no scan is reconstructed yet")
+    for reason in refused:
+        warn(reason)
+    report(1.0, "support removed")
+    return deleted
+
+
+def describe_removal(deleted: dict[str, int]) -> str:
+    """Describe in a sentence what `remove_support` deleted."""
+    counts = ", ".join(f"{name} {count:,} points" for name, count in deleted.items())
+    return f"support removed: {counts}; Undo edit brings it back"
 
 
 def merge_scans(

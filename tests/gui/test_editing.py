@@ -7,7 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from playwright.sync_api import Browser, Page, expect
+from scipy.spatial import cKDTree
 from wizard_page import SIZE, Opened, button, choose, cut_labels, field
 
 from slviewer.devices.simulated import simulated_rig
@@ -19,11 +21,19 @@ from slviewer.pipeline.rig_choice import RigSetup
 from slviewer.server.secure import Serving
 from slviewer.session.scan_edits import load_edits
 from slviewer.simulation.rig import letter
+from slviewer.simulation.turning import turn_pose, turning
 from slviewer.validation.bench_live import true_calibration
 from slviewer.wizard.operator import Operator
 from slviewer.wizard.result_views import scan_cloud, whole_cloud
 
 PATIENCE_S = 40.0
+
+
+def capture_scans(folder: Path, world: SimulatedWorld, angles_deg: dict[str, float], patterns: str = "gray") -> None:
+    """Capture {scan: angle of the table} of what stands before a simulated rig."""
+    for name, angle_deg in angles_deg.items():
+        world.turn_table(angle_deg)
+        capture(folder, name, {}, role="scan", patterns=patterns, set_up=lambda *_: RigSetup(simulated_rig(world)))
 
 
 @pytest.fixture
@@ -33,7 +43,7 @@ def wizard(tmp_path: Path, browser: Browser) -> Iterator[tuple[Opened, App, Oper
     true_calibration(folder, rig)
     world = SimulatedWorld(rig)
     world.place("object")
-    capture(folder, "one", {}, role="scan", patterns="gray", set_up=lambda *_: RigSetup(simulated_rig(world)))
+    capture_scans(folder, world, {"one": 0.0})
     with Operator(folder) as operator:
         operator.reconstruct("one")
         operator.wait_until_idle()
@@ -84,7 +94,7 @@ def test_points_are_selected_deleted_and_brought_back(wizard: tuple[Opened, App,
     valid = np.argwhere(np.isfinite(cloud.points[..., 2]))
     v, u = valid[np.argmin(np.abs(valid - np.median(valid, axis=0)).sum(axis=1))]
     unfold(page, "Edit points")
-    choose(page, "Select by", "polygon")
+    choose(page, "Select by", "lasso")
     page.wait_for_timeout(1500)  # the view moves to the cloud
     x, y = to_screen(app, page, cloud.points[v, u])
     for dx, dy in ((-30, -30), (30, -30), (30, 30), (-30, 30)):
@@ -169,3 +179,52 @@ def test_the_region_is_placed_by_numbers_and_by_its_handle(wizard: tuple[Opened,
     expect(page.get_by_text(re.compile("points shown; the file has all"))).to_be_visible()
     assert cut_labels(page) == []
     assert opened.errors == []
+
+
+def test_six_clicks_make_a_clean_textured_mesh_of_a_part_on_a_table(tmp_path: Path, browser: Browser) -> None:
+    folder, rig = tmp_path / "session", letter(0.25)
+    true_calibration(folder, rig)
+    world = SimulatedWorld(rig)
+    world.place("stone on a table")
+    names = {"a": 0.0, "b": 20.0, "c": 40.0}
+    capture_scans(folder, world, names, "p18")
+    with Operator(folder) as operator:
+        app = App(operator, Serving(port=0))
+        page = browser.new_page(viewport=SIZE)
+        page.set_default_timeout(20_000)
+        opened = Opened(page)
+        page.goto(app.server.link())
+        button(page, "6. Scan").click()
+        for name in names:  # as a capture does with "Align as you scan"
+            operator.reconstruct(name)
+            operator.wait_until_idle()
+            operator.align(name)
+            operator.wait_until_idle()
+        expect(page.get_by_text("seen by more than one; gaps")).to_be_visible(timeout=PATIENCE_S * 1000)
+        page.evaluate("window.clicks = 0; addEventListener('click', () => window.clicks++, true)")
+
+        button(page, "Remove support, 3 scans").click()
+        wait_until(page, lambda: all(operator.snapshot().scan(name).edits for name in names))  # type: ignore[union-attr]
+        button(page, "7. Merge").click()
+        button(page, "Merge 3 scans").click()
+        wait_until(page, lambda: operator.snapshot().session.merge is not None)  # type: ignore[union-attr]
+        button(page, "9. Export").click()
+        button(page, "Write textured mesh").click()
+        link = page.get_by_role("link", name=re.compile(r"Download .*\.glb"))
+        expect(link).to_be_visible(timeout=3 * PATIENCE_S * 1000)
+        with page.expect_download() as started:
+            link.click()
+        assert page.evaluate("window.clicks") == 6
+        started.value.save_as(tmp_path / "part.glb")
+        assert opened.errors == []
+        page.close()
+        app.close()
+    mesh = trimesh.load(tmp_path / "part.glb", force="mesh")
+    points = 1000 * mesh.vertices * [1, -1, -1]  # GLB: m, y up
+    stone = turning(1)["turn_01"]
+    truth = trimesh.Trimesh(turn_pose(stone.pose, names["c"]).to_camera(stone.vertices), stone.triangles)
+    away, nearest = cKDTree(truth.vertices).query(points)
+    height = np.abs(np.sum((points - truth.vertices[nearest]) * truth.vertex_normals[nearest], axis=1))
+    assert 0.02 < np.median(height) < 0.2 and np.percentile(height, 99) < 0.6  # the calibration is without distortion
+    assert away.max() < 3.0  # nothing is left of the table
+    assert np.asarray(mesh.visual.material.baseColorTexture).shape[:2] == (2048, 2048)

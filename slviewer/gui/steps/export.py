@@ -58,6 +58,8 @@ METHODS: dict[Method, str] = {
 }
 SMALL, OPEN, SIZED, CLOSED = "fill small", "keep open", "fill up to size", "watertight"
 TEXTURES = {"none": None, "1024 px": 1024, "2048 px": 2048, "4096 px": 4096}
+TEXTURE = "2048 px"
+"""Of the textured mesh that one button writes."""
 SMOOTHING = {"none": 0, "light": 5, "strong": 20}
 """Number of iterations."""
 
@@ -118,10 +120,14 @@ class Panel(StepPanel):
             self._files = Text(gui)
         with gui.add_folder("Cloud or mesh"):
             self._source = Choice(gui, "Source")
+            self._finish = context.button(
+                "Write textured mesh", self._request_textured, viser.Icon.BRUSH, None,
+                hint="GLB with an image of the surface, 2048 px: for viewers and presentations",
+            )  # fmt: skip
             self._as: Any = gui.add_dropdown("Type", (POINTS, MESH))
             self._mesh = MeshInputs(context, self._describe)
             self._shape_format = Choice(gui, "File type")
-            self._texture = gui.add_dropdown(
+            self._texture: Any = gui.add_dropdown(
                 "Texture", tuple(TEXTURES), hint="An image of the surface, projected from the scans; thins the mesh"
             )
             self._shape_note = Text(gui)
@@ -169,7 +175,8 @@ class Panel(StepPanel):
         refused = session.calibration is not None and bool(session.calibration.refused)
         change(self._report, disabled=busy or not ready)
         change(self._write_numbers, disabled=busy or not ready or refused)
-        change(self._write, disabled=busy or not things or refused)
+        for button in (self._write, self._finish):
+            change(button, disabled=busy or not things or refused)
         change(self._table, disabled=busy or not session.verifications)
         self._describe()
 
@@ -267,6 +274,13 @@ class Panel(StepPanel):
             chosen = self._shape_format.value
             texture = TEXTURES[self._texture.value] if plan is not None and chosen in TEXTURED_FORMATS else None
             self._operator.export(what, name, chosen, plan, texture)
+
+    def _request_textured(self) -> None:
+        """Choose a mesh with a texture as GLB, and request its file."""
+        self._as.value, self._texture.value = MESH, TEXTURE
+        self._describe()  # offers the formats of a mesh
+        self._shape_format.choose("glb")
+        self._request_shape()
 
     def _request_numbers(self) -> None:
         """Request the file of the chosen numbers: calibration, poses or coefficients."""

@@ -38,6 +38,7 @@ class Panel(StepPanel):
         self._merged: int | None = None
         self._clouds: ColouredClouds | None = None
         self._layer_shown: bool | None = None
+        self._is_start_chosen = False
 
     def build(self) -> None:
         """Create the inputs of scans, alignment and view."""
@@ -49,6 +50,7 @@ class Panel(StepPanel):
             self._reference.on_change(context.callback(self._refresh))
             self._start: Any = gui.add_dropdown("Start from", STARTS, hint="Initial alignment, which is then refined")
             self._start.on_update(context.callback(self._change_start))
+            self._start.on_update(context.callback(self._keep_start, by_user=True))
             self._angle: Any = gui.add_number(
                 "Angle, °", 30.0, min=1.0, max=180.0, step=0.5, hint="Of the turntable, from each scan to the next"
             )
@@ -83,6 +85,7 @@ class Panel(StepPanel):
             failure = snapshot.merge_failure
             self._failure.set(merge_failure_html(failure, labels, merge) if failure else "")
             self._offer_views(merge)
+            self._propose_start(scans)
             number = int(merge.name) if merge is not None else 0
             if self._merged is not None and number > self._merged:
                 self._view.choose(AFTER)  # show what was just merged
@@ -119,6 +122,24 @@ class Panel(StepPanel):
             views.append(SIDE_BY_SIDE)
         self._view.offer([(view, view) for view in views])
         self._view.set_visible(len(views) > 1)
+
+    def _keep_start(self) -> None:
+        """Keep the operator's choice of the initial alignment."""
+        self._is_start_chosen = True
+
+    def _propose_start(self, scans: list[ScanView]) -> None:
+        """Choose the initial alignment that the chosen scans bring along, unless the operator chose one."""
+        if self._is_start_chosen:
+            return
+        names = set(self._list_chosen())
+        chosen = [scan for scan in scans if scan.name in names]
+        if not chosen:
+            return
+        turned = self._get_stored_angles([scan.name for scan in chosen]) is not None
+        placed = all(scan.placement is not None and scan.placement.T_first_scan is not None for scan in chosen)
+        start = TURNTABLE if turned else PLACED if placed else FEATURES
+        if self._start.value != start:
+            self._start.value = start
 
     def _change_start(self) -> None:
         """Update the views for another initial alignment; picked points are shown side by side."""

@@ -97,7 +97,7 @@ class Panel(StepPanel):
             self._live_status = Text(gui)
             self._turn = TurnInputs(context)
             self._simulated = SimulatedObject(
-                context, LAYER, ("object", "stone", "marked", "sphere", "plane", *CONCAVE)
+                context, LAYER, ("object", "stone", "stone on a table", "marked", "sphere", "plane", *CONCAVE)
             )
         self._gallery = Text(gui)
         with gui.add_folder("Cloud", visible=False) as self._cloud_folder:
@@ -115,6 +115,10 @@ class Panel(StepPanel):
             self._take_out = context.button(
                 "Undo alignment", lambda: operator.undo_alignment(self._scan.value), viser.Icon.ARROW_BACK_UP
             )
+            self._support = context.button(
+                "Remove support", lambda: operator.remove_support(*self._shown_scans()), viser.Icon.TABLE_MINUS,
+                hint="Deletes the plane that the object stands on, and all below it; Undo edit brings it back",
+            )  # fmt: skip
             self._view = Choice(gui, "3D view")
             self._colour = gui.add_dropdown("Colour", COLOURS)
             self._legend = Text(gui)
@@ -231,6 +235,10 @@ class Panel(StepPanel):
             self._region.draw(session, scan.name if scan.cloud != "absent" else "")
             self._editing.draw(scan)
             self._draw_placement(scan, self._snapshot.is_busy)
+            shown = len(self._shown_scans())
+            label = "Remove support" if shown == 1 else f"Remove support, {shown} scans"
+            usable = scan.cloud != "absent" and shape_of(scan) == "scan"
+            change(self._support, label=label, disabled=self._snapshot.is_busy or not usable)
             self._gallery.set(gallery(sort_scans(session.scans) if session else (), scan.name))
             if self._is_live:
                 return
@@ -261,6 +269,13 @@ class Panel(StepPanel):
 
             used = session.restriction(scan.name) if session else None
             self._painter.request("cloud", (key, used, self._redraws, colour), make, self._draw_cloud)
+
+    def _shown_scans(self) -> tuple[str, ...]:
+        """Return the names of the scans in the 3D view: those in place, or the chosen one."""
+        session = self._snapshot.session if self._snapshot else None
+        if session is not None and self._view.value == ALIGNED:
+            return tuple(scan.name for scan in session.scans if is_placed(scan))
+        return (self._scan.value,)
 
     def _offer_views(self, scans: Sequence[ScanView]) -> None:
         """Offer to view the aligned scans together, and do so when another one came to its place."""
