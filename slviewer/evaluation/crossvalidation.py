@@ -1,6 +1,6 @@
 """How well each calibration measures target poses that it was not made from.
 
-A pose that is left out is measured from its smoothed phase, so that what remains is the calibration's error and hardly
+A pose that is held out is measured from its smoothed phase, so that what remains is the calibration's error and hardly
 any camera noise. The board itself is the standard: how flat it comes out, how long, and how near its features lie to
 where they are on it when it is laid over them without stretching.
 """

@@ -31,7 +31,7 @@ FOLDER = "placement"
 MOST_TRIED = 3
 """Scans that a new one is aligned to at most: the latest, then those before it."""
 _PIXELS = 130_000
-"""Of a scan that is aligned: rows and columns are left out of larger ones."""
+"""Of a scan that is aligned: rows and columns of larger ones are skipped."""
 _SHOWN_POINTS = 25_000  # of a scan
 _REACH = 2.5  # spacings of the shown points
 

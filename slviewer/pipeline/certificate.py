@@ -8,7 +8,8 @@ import platform
 import re
 import shutil
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from functools import cache
 from importlib.metadata import version
@@ -45,7 +46,7 @@ from slviewer.records import from_plain
 from slviewer.report.page import CERTIFICATE, Column, Section, Table, page_digest
 from slviewer.session.decisions import REGION_INPUT
 from slviewer.session.measurements import Measurement
-from slviewer.session.nominal import read_nominal
+from slviewer.session.nominal import NOMINALS, read_nominal
 from slviewer.session.reading import expand_user, read_file
 from slviewer.session.scan_edits import load_edits, load_region, restriction_inputs, save_edits, save_region
 from slviewer.session.store import Session
@@ -57,8 +58,6 @@ RELATIVE = 1e-3
 """Difference of a figure, as a share of it, up to which it is the same: other processors round otherwise."""
 ABSOLUTE = 2e-6
 """... and in the figure's own unit, mm or px."""
-NOMINALS = "nominal"
-"""Folder of a session with the nominal models that were uploaded."""
 _MAX_REPORT_BYTES = 1 << 29
 FRAMES = "frames of "
 _BY_OPERATOR = ("excluded by the operator", "not among the poses", "excluded for this calibration")
@@ -127,7 +126,7 @@ class ReportCheck:
 def make_certificate(store: Session) -> Certificate:
     """Return the certificate of a session as it is, without the digest of a page; reads every frame."""
     captures = {
-        capture.name: {"role": capture.role, "hash": capture.hash, "frames": capture.frame_hashes()}
+        capture.name: {"role": capture.role, "hash": capture.hash, "frames": capture.verify()}
         for capture in store.captures()
     }
     results = {name: store.input_hashes(name)[name] for name in store.result_names()}
@@ -142,13 +141,7 @@ def collect_figures(store: Session) -> Figures:
             figures[f"calibration/{name}"] = _calibration_figures(store, name)
     for name in numbered_results(store, "verify"):
         if store.state_of(name) == "fresh":
-            models = store.load_result(name, only=())[0]["models"]
-            figures[name] = {
-                f"{model} {key}": float(values[key])
-                for model, values in models.items()
-                for key in ("rms_mm", "noise_floor_mm", "radius_mm")
-                if values[key] is not None
-            }
+            figures[name] = _verification_figures(store.load_result(name, only=())[0]["models"])
     for measured in load_measurements(store):
         if not measured.stale:
             figures[f"measurements/{measured.id}"] = _measurement_figures(measured)
@@ -218,6 +211,16 @@ def _calibration_figures(store: Session, name: str) -> dict[str, float]:
     return figures | {"baseline, mm": stereo.baseline_mm}
 
 
+def _verification_figures(models: Mapping[str, Mapping[str, Any]]) -> dict[str, float]:
+    """Return the figures of a plane or sphere that was measured with each model."""
+    return {
+        f"{model} {key}": float(values[key])
+        for model, values in models.items()
+        for key in ("rms_mm", "noise_floor_mm", "radius_mm")
+        if values[key] is not None
+    }
+
+
 def _measurement_figures(measured: Measurement) -> dict[str, float]:
     """Return a measurement's values and uncertainties."""
     values = {f"{q.name}, {q.unit}": q.value for q in quantities_of(measured)}
@@ -251,8 +254,7 @@ def _check_frames(store: Session, certificate: Certificate) -> list[Check]:
             checks.append(Check(what, "missing", "the session has no such capture, or it is damaged"))
             continue
         try:
-            captures[name].verify()
-            now = captures[name].frame_hashes()
+            now = captures[name].verify()
         except SlviewerError as error:
             checks.append(Check(what, "differs", str(error)))
             continue
@@ -283,7 +285,7 @@ def _recompute(
         figures = collect_figures(fresh)
         for k, name in enumerate(names):
             progress(0.6 + 0.2 * k / len(names), f"measuring {name.removeprefix('verify/')}")
-            with _noting(why, name):
+            with _note_failure(why, name):
                 figures[name] = _verify_again(store, fresh, name)
         figures |= _measure_again(store, fresh, certificate, why, progress)
     return figures, why
@@ -310,10 +312,10 @@ def _calibrate_again(store: Session, fresh: Session, why: dict[str, str]) -> Non
             own = ("hash", "arrays", "checksums")  # which the session writes itself
             fresh.save_result(f"calibration/{name}", {k: v for k, v in saved.items() if k not in own}, arrays)
         return
-    left_out = [name for name, reason in stereo.excluded.items() if reason.startswith(_BY_OPERATOR)]
-    poses = [name for name in (*stereo.poses, *stereo.excluded) if name not in left_out and name in fresh.taken_names()]
+    excluded = [name for name, reason in stereo.excluded.items() if reason.startswith(_BY_OPERATOR)]
+    poses = [name for name in (*stereo.poses, *stereo.excluded) if name not in excluded and name in fresh.taken_names()]
     settings = meta["settings"]
-    with _noting(why, *(f"calibration/{name}" for name in models)):
+    with _note_failure(why, *(f"calibration/{name}" for name in models)):
         calibrate(
             fresh,
             settings["target"],
@@ -332,12 +334,7 @@ def _verify_again(store: Session, fresh: Session, result: str) -> dict[str, floa
     """Measure a plane or sphere again, with the models that were compared before; return its figures."""
     name, meta = result.removeprefix("verify/"), store.load_result(result, only=())[0]
     found = verify(fresh, [name], meta["shape"], models=list(meta["models"]), check=False).captures[name].to_json()
-    return {
-        f"{model} {key}": float(values[key])
-        for model, values in found["models"].items()
-        for key in ("rms_mm", "noise_floor_mm", "radius_mm")
-        if values[key] is not None
-    }
+    return _verification_figures(found["models"])
 
 
 def _measure_again(
@@ -354,7 +351,7 @@ def _measure_again(
         if measured.source.startswith(MERGED) or MERGED in measured.source:
             why[result] = "merges are not registered again"
             continue
-        with _noting(why, result):
+        with _note_failure(why, result):
             _check_restrictions(store, measured)
             made = _repeat(store, fresh, measured, surface, again)
             again[measured.id] = made.id
@@ -419,19 +416,13 @@ def _find_nominal(store: Session, content: str) -> Path:
     raise InputError("its nominal model is not in the session")
 
 
-class _noting:  # noqa: N801 (a context manager, used as a function)
+@contextmanager
+def _note_failure(why: dict[str, str], *results: str) -> Iterator[None]:
     """Note the reason of a failure for these results, and go on."""
-
-    def __init__(self, why: dict[str, str], *results: str) -> None:
-        self._why, self._results = why, results
-
-    def __enter__(self) -> None: ...
-
-    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> bool:
-        if not isinstance(error, SlviewerError):
-            return False
-        self._why |= dict.fromkeys(self._results, str(error))
-        return True
+    try:
+        yield
+    except SlviewerError as error:
+        why |= dict.fromkeys(results, str(error))
 
 
 def _compare(name: str, given: Mapping[str, float], made: Mapping[str, float] | None, why: Mapping[str, str]) -> Check:

@@ -10,7 +10,7 @@ def triangulate_grid(points: np.ndarray, max_jump: float) -> np.ndarray:
 
     (The vertices are ``points[np.isfinite(points).all(axis=-1)]``.) Each square of four neighbouring pixels gives two
     triangles, cut along the diagonal with the smaller step in depth, or one where only three are valid. Triangles whose
-    depths differ by more than ``max_jump`` mm are left out: there the surface ends. Faces turn counter-clockwise as the
+    depths differ by more than ``max_jump`` mm are excluded: there the surface ends. Faces turn counter-clockwise as the
     camera sees them from outside: their normals point towards it.
     """
     if points.ndim != 3 or points.shape[2] != 3:

@@ -97,7 +97,7 @@ def normals(points: np.ndarray, reach: int = 2) -> np.ndarray:
 
     The cross product of the surface's differences along rows and columns: central differences, averaged by least
     squares over the valid pixels of a window of 2 ``reach`` + 1, because two neighbours alone would show little but
-    their noise. Neighbours across a depth jump are left out.
+    their noise. Neighbours across a depth jump are excluded.
     """
     points = np.ascontiguousarray(points, dtype=np.float32)
     if points.ndim != 3 or points.shape[2] != 3:

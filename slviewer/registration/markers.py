@@ -35,7 +35,7 @@ _FIT_REACH = 0.75
 @dataclass(frozen=True, eq=False)
 class MeasuredMarkers:
     """Markers on a scan: numbers ``ids`` (n,), ``corners`` (n, 4, 3) mm in the scan's frame, their standard deviations
-    ``sigma_mm`` (n, 4), and the numbers that were ``repeated`` and are left out."""
+    ``sigma_mm`` (n, 4), and the numbers that were ``repeated`` and are excluded."""
 
     ids: np.ndarray
     corners: Floats
@@ -218,7 +218,7 @@ def _largest_gaps(T: Floats, p: Floats, q: Floats) -> Floats:
 
 
 def marker_notes(measured: Mapping[str, MeasuredMarkers]) -> list[str]:
-    """Sentences on markers that were left out, and on scans that show none."""
+    """Warnings about markers that were excluded, and on scans that show none."""
     notes = []
     for name, markers in measured.items():
         if markers.repeated:

@@ -22,7 +22,6 @@ from slviewer.session.reading import decoding, read_json
 from slviewer.session.stack import (
     check_frames,
     describe_stack,
-    digest_stack,
     hash_frames,
     hash_stack,
     identify_stack,
@@ -101,18 +100,17 @@ class Capture:
             raise SessionError(f"capture {self.name!r} was replaced while it was in use: load it again")
         return stack
 
-    def verify(self) -> None:
-        """Read everything; raises DamagedError unless the frames and their description are those that were saved."""
+    def verify(self) -> list[str]:
+        """Read everything; returns the hash of each stored frame. Raises DamagedError unless the frames and their
+        description are those that were saved."""
+        content, frames = hash_stack(self.folder / "frames.zarr")
         described, exposures_ms = self.meta["sequence"], self.meta.get("exposures_ms")
-        if _hash_content(hash_stack(self.folder / "frames.zarr"), described, exposures_ms, self.texture) != self.hash:
+        if _hash_content(content, described, exposures_ms, self.texture) != self.hash:
             raise DamagedError(
                 f"{self.name}: what {self.folder} holds is not what was saved (its hash differs): restore the folder "
                 "from a copy, or import or record the capture again"
             )
-
-    def frame_hashes(self) -> list[str]:
-        """The hash of each stored frame, BLAKE2b of 160 bits; reads all. Raises DamagedError for a damaged one."""
-        return [digest.hex() for digest in digest_stack(self.folder / "frames.zarr")]
+        return frames
 
     @property
     def exposures_ms(self) -> tuple[float, ...]:

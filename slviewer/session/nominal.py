@@ -18,6 +18,8 @@ from slviewer.session.reading import expand_user, read_file
 from slviewer.surface.shapes import Mesh
 
 Units = Literal["mm", "cm", "m", "inch"]
+NOMINALS = "nominal"
+"""Folder of a session with the nominal models that were uploaded."""
 FORMATS = (".stl", ".ply", ".obj", ".step", ".stp", ".3mf")
 MAX_BYTES = 1 << 28
 MAX_TEXT_BYTES = 1 << 27

@@ -70,14 +70,9 @@ def read_stack(path: Path, indices: Sequence[int] | None = None) -> np.ndarray:
     return frames if sys.byteorder == "little" else frames.byteswap(inplace=True)
 
 
-def hash_stack(path: Path) -> str:
-    """Read a whole stack and return its content hash, as `write_stack` does. Raises DamagedError as `read_stack`."""
-    stack = _StoredStack.open(path)
-    return _combine_digests(stack.shape, stack.dtype, digest_stack(path))
-
-
-def digest_stack(path: Path) -> list[bytes]:
-    """Read a whole stack and return the digest of each frame. Raises DamagedError as `read_stack`."""
+def hash_stack(path: Path) -> tuple[str, list[str]]:
+    """Read a whole stack; returns its content hash, as `write_stack` does, and the hash of each frame, BLAKE2b of 160
+    bits. Raises DamagedError as `read_stack`."""
     stack = _StoredStack.open(path)
 
     def digest(index: int) -> bytes:
@@ -88,7 +83,8 @@ def digest_stack(path: Path) -> list[bytes]:
         return _digest(frame)
 
     with ThreadPoolExecutor(_THREADS) as pool:
-        return list(pool.map(digest, range(stack.shape[0])))
+        digests = list(pool.map(digest, range(stack.shape[0])))
+    return _combine_digests(stack.shape, stack.dtype, digests), [each.hex() for each in digests]
 
 
 def hash_frames(frames: np.ndarray) -> str:

@@ -141,7 +141,7 @@ class Renderer:
     def _indirect_light(self, axis: Axis, profile_light: np.ndarray) -> np.ndarray:
         """Light at unit exposure, (h, w) float32, that the surface throws on itself under a profile (n,) in 0 ... 1.
 
-        The camera's PSF is left out: this light varies slowly.
+        The camera's PSF is neglected: this light varies slowly.
         """
         if axis not in self._indirect:
             assert isinstance(self.scene, ConcaveScene)

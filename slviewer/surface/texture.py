@@ -1,7 +1,7 @@
 """A mesh with a texture: an image of its surface, projected from the scans that saw it.
 
 Every texel takes the mean of the scans that see it, weighted by how squarely they look at it, by their noise and by the
-distance to their border; scans in whose way something stands are left out. Exposures are equalised over what two scans
+distance to their border; scans in whose way something stands are excluded. Exposures are equalised over what two scans
 saw. The image shows the surface's reflectance where the light's place is known: what a scan sees falls with the cosine
 of the projector's angle and the square of its distance, which is divided out.
 """

@@ -17,12 +17,12 @@ from slviewer.session import atomic
 from slviewer.session.inspection_plan import write_plan
 from slviewer.session.measurements import Measurement
 from slviewer.session.names import safe_name
-from slviewer.session.nominal import Units, read_nominal
+from slviewer.session.nominal import NOMINALS, Units, read_nominal
 from slviewer.session.store import Session
 from slviewer.wizard.export_files import staged_export
 from slviewer.wizard.jobs import Reporter
 from slviewer.wizard.requests import RequestHandler, request
-from slviewer.wizard.surfaces import NOMINALS, Surfaces
+from slviewer.wizard.surfaces import Surfaces
 
 P = ParamSpec("P")
 TABLE, PLAN = "measurements.csv", "plan.toml"

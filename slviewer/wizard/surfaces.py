@@ -11,12 +11,10 @@ from slviewer.pipeline.models import load_model
 from slviewer.pipeline.scale import scale_factor
 from slviewer.pipeline.scan_edits import restrict_cloud
 from slviewer.reconstruction.cloud import Cloud
+from slviewer.session.nominal import NOMINALS
 from slviewer.session.scan_edits import load_region, restriction_inputs
 from slviewer.session.store import Session
 from slviewer.wizard.result_views import nearest
-
-NOMINALS = "nominal"
-"""The session's folder of nominal models."""
 
 
 class Surfaces:
