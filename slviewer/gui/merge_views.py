@@ -27,11 +27,15 @@ SHOWN = 60_000
 
 @dataclass(frozen=True, eq=False)
 class ColouredClouds:
-    """Clouds by name, points (..., 3) mm and colours each, with a legend; `view` changes with their positions."""
+    """Clouds by name, points (..., 3) mm and colours each, with a legend; `view` changes with their positions.
+
+    ``scans``: for clouds of scans, in the same order, what they were made from, and their poses (4, 4) in the view.
+    """
 
     view: str
     clouds: Mapping[str, tuple[np.ndarray, np.ndarray | Colour]]
     legend: Html
+    scans: tuple[tuple[result_views.ScanCloud, np.ndarray], ...] = ()
 
     @cached_property
     def points(self) -> np.ndarray | None:
@@ -43,14 +47,13 @@ def colour_scans(
     session: Session, names: Sequence[str], places: Mapping[str, np.ndarray], titles: Mapping[str, str]
 ) -> ColouredClouds:
     """Load scans, each in a colour, at their ``places`` (4, 4), or as captured where they have none."""
+    scans = tuple((result_views.scan_cloud(session, name), places.get(name, np.eye(4))) for name in names)
     clouds: dict[str, tuple[np.ndarray, np.ndarray | Colour]] = {}
-    for i, name in enumerate(names):
-        cloud = result_views.scan_cloud(session, name)
-        T = places.get(name, np.eye(4))
-        clouds[name] = ((cloud.points @ T[:3, :3].T + T[:3, 3]).astype(np.float32), SCAN_COLOURS[i % len(SCAN_COLOURS)])
-    return ColouredClouds(
-        "after" if places else "before", clouds, _format_patches([titles.get(name, name) for name in names])
-    )
+    for i, (cloud, T) in enumerate(scans):
+        points = (cloud.points @ T[:3, :3].T + T[:3, 3]).astype(np.float32)
+        clouds[cloud.name] = (points, SCAN_COLOURS[i % len(SCAN_COLOURS)])
+    legend = _format_patches([titles.get(name, name) for name in names])
+    return ColouredClouds("after" if places else "before", clouds, legend, scans)
 
 
 def colour_merge(session: Session, merge: str, view: str, titles: Sequence[str]) -> ColouredClouds:

@@ -1,7 +1,8 @@
 """Setting the region of interest of a session, and deleting points of a scan so that they can be brought back."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
@@ -14,9 +15,9 @@ from slviewer.pipeline.open_session import SessionLike, opened
 from slviewer.pipeline.scan_edits import OFF, parse_region
 from slviewer.session.scan_edits import list_edits, load_edits, load_region, save_edits, save_region
 from slviewer.session.store import Session
-from slviewer.surface.point_edits import make_edit
+from slviewer.surface.point_edits import Edit, make_edit
 from slviewer.surface.region_of_interest import RegionOfInterest
-from slviewer.surface.selection import SupportPlane, select_connected, select_polygon, select_support
+from slviewer.surface.selection import Mask, SupportPlane, select_connected, select_polygon, select_support
 
 SUPPORT = "support and below"
 """How the points of a support are said to be selected."""
@@ -107,32 +108,76 @@ def edit_scan(
             selected, what = select_polygon(cloud.sigma_z.shape, np.reshape(polygon, (-1, 2))), "polygon"
         if invert:
             selected, what, plane = ~selected, f"all but {what}", None
-        delete_points(store, scan, cloud.points, selected, what, plane)
+        delete_points(store, [Selection(scan, cloud.points, selected, plane)], what)
         remaining = int(np.count_nonzero(cloud.mask & ~selected))
         progress(1.0, "edited")
         return ScanEdits(scan, *list_edits(store, scan), remaining)
 
 
-def delete_points(
-    store: Session, scan: str, points: np.ndarray, selected: np.ndarray, what: str, plane: SupportPlane | None = None
-) -> int:
-    """Delete the ``selected`` (h, w) of the points (h, w, 3) mm that a scan shows; returns how many. ``what``: how they
-    were selected; ``plane``: what they all lie below of, where they do.
+@dataclass(frozen=True, eq=False)
+class Selection:
+    """Points of a scan that are to be deleted: the ``selected`` (h, w) of its ``points`` (h, w, 3) mm, and the
+    ``plane`` that they all lie below of, where they do."""
 
-    InputError where nothing is selected, or nothing would remain.
+    scan: str
+    points: np.ndarray
+    selected: Mask
+    plane: SupportPlane | None = None
+
+
+def delete_points(store: Session, selections: Sequence[Selection], what: str) -> dict[str, int]:
+    """Delete what is selected of one or several scans, in one step: {scan: points deleted}. ``what``: how it was
+    selected. Scans of which nothing is selected stay as they are.
+
+    InputError where nothing is selected at all, or nothing would remain of a scan.
     """
-    edit = make_edit(points, selected, what, plane)
-    measured = int(np.count_nonzero(np.isfinite(points).all(axis=-1)))
-    if edit.points == measured:
-        raise InputError(f"all {measured} points of {scan} are selected: select fewer, or delete the scan")
-    save_edits(store, scan, load_edits(store, scan).add(edit))
-    return edit.points
+    made = datetime.now(UTC).isoformat(timespec="milliseconds")
+    edits = dict[str, Edit]()
+    for each in selections:
+        measured = np.isfinite(each.points).all(axis=-1)
+        if not (each.selected & measured).any():
+            continue
+        edit = make_edit(each.points, each.selected, what, each.plane, made)
+        if edit.points == (total := int(np.count_nonzero(measured))):
+            raise InputError(f"all {total} points of {each.scan} are selected: select fewer, or delete the scan")
+        edits[each.scan] = edit
+    if not edits:
+        raise InputError("no point is selected: select some first")
+    with store.together():
+        for scan, edit in edits.items():
+            save_edits(store, scan, load_edits(store, scan).add(edit))
+    return {scan: edit.points for scan, edit in edits.items()}
 
 
 def change_history(store: Session, scan: str, *, undo: int = 0, redo: int = 0) -> None:
     """Undo or redo so many edits of a scan. InputError where there are fewer."""
     history = load_edits(store, scan)
     save_edits(store, scan, history.undo(undo) if undo else history.redo(redo))
+
+
+def undo_last(store: Session, scans: Sequence[str]) -> None:
+    """Undo the last edit among those of several scans, of all scans that it was made of. InputError where none is."""
+    histories = {scan: load_edits(store, scan) for scan in scans}
+    made = {scan: history.active[-1].made for scan, history in histories.items() if history.active}
+    _change_together(store, made, max(made.values(), default=""), undo=1)
+
+
+def redo_next(store: Session, scans: Sequence[str]) -> None:
+    """Bring back what `undo_last` undid last. InputError where nothing was undone."""
+    histories = {scan: load_edits(store, scan) for scan in scans}
+    made = {scan: history.undone[0].made for scan, history in histories.items() if history.undone}
+    _change_together(store, made, min(made.values(), default=""), redo=1)
+
+
+def _change_together(store: Session, made: Mapping[str, str], when: str, *, undo: int = 0, redo: int = 0) -> None:
+    """Undo or redo an edit of each of the scans whose edit was ``made`` at that time; the first one's where none is
+    known. InputError without scans."""
+    scans = [scan for scan, time in made.items() if time == when][: None if when else 1]
+    if not scans:
+        raise InputError(f"no edit can be {'undone' if undo else 'redone'}: there is none")
+    with store.together():
+        for scan in scans:
+            change_history(store, scan, undo=undo, redo=redo)
 
 
 def set_region(

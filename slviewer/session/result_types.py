@@ -7,7 +7,7 @@ have their shapes checked by the classes that are made of them.
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, Required, TypedDict
+from typing import Annotated, Any, Literal, NotRequired, Required, TypedDict
 
 import msgspec
 
@@ -141,6 +141,7 @@ class _Edit(TypedDict):
     normal: _Triple | None
     offset_mm: float | None
     margin_mm: float | None
+    made: NotRequired[str]
 
 
 class _Edits(ResultMeta, total=False):

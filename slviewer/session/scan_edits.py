@@ -59,7 +59,8 @@ def save_edits(store: Session, scan: str, history: EditHistory) -> None:
     entries = [_to_plain(edit) for edit in history.edits]
     content = hashlib.blake2b(digest_size=20)
     for i, entry in enumerate(entries[: history.applied]):
-        content.update(repr(sorted(entry.items())).encode() + arrays.get(str(i), np.zeros(0, np.uint8)).tobytes())
+        used = sorted((key, value) for key, value in entry.items() if key != "made")
+        content.update(repr(used).encode() + arrays.get(str(i), np.zeros(0, np.uint8)).tobytes())
     meta = {
         "capture": capture.hash,
         "size": list(capture.size),
@@ -118,17 +119,19 @@ def _to_plain(edit: Edit) -> dict[str, object]:
         "normal": None if plane is None else list(plane.normal),
         "offset_mm": None if plane is None else plane.offset_mm,
         "margin_mm": None if plane is None else plane.margin_mm,
+        "made": edit.made,
     }
 
 
 def _read_edit(index: int, entry: dict[str, object], size: tuple[int, int], arrays: dict[str, np.ndarray]) -> Edit:
     """Return the edit of an entry; InputError, KeyError for one that does not fit the arrays."""
     what, points = str(entry["what"]), int(entry["points"])  # type: ignore[call-overload]
+    made = str(entry.get("made", ""))
     if entry["kind"] == "pixels":
-        return Edit(what, points, unpack_mask(arrays[str(index)], size))
+        return Edit(what, points, unpack_mask(arrays[str(index)], size), made=made)
     numbers = [*(entry["normal"] or ()), entry["offset_mm"], entry["margin_mm"]]  # type: ignore[misc]
     values = np.array(numbers, float)
     if values.shape != (5,) or not np.isfinite(values).all() or abs(np.linalg.norm(values[:3]) - 1) > 1e-3:
         raise InputError(f"the plane of edit {index + 1} has the numbers {numbers}")
     x, y, z, offset, margin = values.tolist()
-    return Edit(what, points, plane=SupportPlane((x, y, z), offset, margin))
+    return Edit(what, points, plane=SupportPlane((x, y, z), offset, margin), made=made)

@@ -22,13 +22,15 @@ _MAX_PIXELS = 1 << 32
 class Edit:
     """Points that are deleted: those at ``pixels`` (h, w) bool, or those on ``plane`` and below, one of both.
 
-    ``what``: how they were selected, in words; ``points``: how many it deleted when it was made.
+    ``what``: how they were selected, in words; ``points``: how many it deleted when it was made; ``made``: when, as
+    text that sorts by time, the same for edits of several scans that were made together; empty where unknown.
     """
 
     what: str
     points: int
     pixels: Mask | None = None
     plane: SupportPlane | None = None
+    made: str = ""
 
     def __post_init__(self) -> None:
         if (self.pixels is None) == (self.plane is None):
@@ -107,7 +109,7 @@ class EditHistory:
         return kept
 
 
-def make_edit(points: np.ndarray, selected: Mask, what: str, plane: SupportPlane | None = None) -> Edit:
+def make_edit(points: np.ndarray, selected: Mask, what: str, plane: SupportPlane | None = None, made: str = "") -> Edit:
     """Return the edit that deletes the ``selected`` (h, w) ones of points (h, w, 3) mm: with every later calibration,
     also those at selected pixels that are NaN now.
 
@@ -117,7 +119,7 @@ def make_edit(points: np.ndarray, selected: Mask, what: str, plane: SupportPlane
     count = int(np.count_nonzero(selected & np.isfinite(points).all(axis=-1)))
     if not count:
         raise InputError("no point is selected: select some first")
-    return Edit(what, count, plane=plane) if plane is not None else Edit(what, count, selected)
+    return Edit(what, count, selected if plane is None else None, plane, made)
 
 
 def pack_mask(mask: Mask) -> NDArray[np.uint8]:

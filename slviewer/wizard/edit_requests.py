@@ -1,14 +1,12 @@
 """Requests to set the region of interest, and to delete points of scans so that they can be brought back."""
 
+from collections.abc import Sequence
 from functools import partial
 
-import numpy as np
-
 from slviewer.errors import InputError
-from slviewer.pipeline.edit import change_history, delete_points
+from slviewer.pipeline.edit import Selection, delete_points, redo_next, undo_last
 from slviewer.session.scan_edits import load_region, save_region
 from slviewer.surface.region_of_interest import RegionOfInterest
-from slviewer.surface.selection import SupportPlane
 from slviewer.wizard import tasks
 from slviewer.wizard.requests import RequestHandler, request
 from slviewer.wizard.result_views import whole_cloud
@@ -38,12 +36,12 @@ class EditRequests(RequestHandler):
         save_region(store, RegionOfInterest.around(whole_cloud(store, scan).points))
 
     @request("Deleting points")
-    def delete_points(
-        self, scan: str, points: np.ndarray, selected: np.ndarray, what: str, plane: SupportPlane | None = None
-    ) -> None:
-        """Delete the ``selected`` (h, w) of the points (h, w, 3) mm that are shown of a scan; `undo_edit` undoes it."""
-        count = delete_points(self._engine.store, scan, points, selected, what, plane)
-        self._engine.notices.add("info", f"{scan}: {count:,} points deleted; Undo brings them back")
+    def delete_points(self, selections: Sequence[Selection], what: str) -> None:
+        """Delete what is selected of the points that are shown of one or several scans; `undo_edit` undoes it."""
+        counts = delete_points(self._engine.store, selections, what)
+        self._engine.notices.add(
+            "info", f"{', '.join(counts)}: {sum(counts.values()):,} points deleted; Undo edit brings them back"
+        )
 
     @request("Removing the support")
     def remove_support(self, *scans: str) -> None:
@@ -52,11 +50,11 @@ class EditRequests(RequestHandler):
         self._submit("Removing the support", remove, tasks.describe_removal)
 
     @request("Undoing the edit")
-    def undo_edit(self, scan: str) -> None:
-        """Undo the last edit of a scan."""
-        change_history(self._engine.store, scan, undo=1)
+    def undo_edit(self, *scans: str) -> None:
+        """Undo the last edit of scans, of all those that it was made of."""
+        undo_last(self._engine.store, scans)
 
     @request("Redoing the edit")
-    def redo_edit(self, scan: str) -> None:
-        """Bring the last edit that was undone back."""
-        change_history(self._engine.store, scan, redo=1)
+    def redo_edit(self, *scans: str) -> None:
+        """Bring the last edit of scans that was undone back."""
+        redo_next(self._engine.store, scans)

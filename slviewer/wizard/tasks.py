@@ -22,7 +22,7 @@ from slviewer.evaluation.plane import PlaneResult
 from slviewer.evaluation.sphere import SphereResult
 from slviewer.pipeline.align import Placement, align_scan, list_scans, load_placement
 from slviewer.pipeline.calibrate import CalibrationResult, calibrate
-from slviewer.pipeline.edit import SUPPORT, delete_points
+from slviewer.pipeline.edit import SUPPORT, Selection, delete_points
 from slviewer.pipeline.feedback import Warn
 from slviewer.pipeline.merge import Merge, Picked, StartKind, merge, merge_record
 from slviewer.pipeline.models import POSES_FOR_PIXELWISE, accepts_rejected, available_models, best_model
@@ -194,7 +194,7 @@ def remove_support(session: Session, names: list[str], report: Reporter, warn: W
     Scans without such a plane, and those that it was deleted from before, stay as they are, with a warning. InputError
     where all of them do.
     """
-    deleted, refused = dict[str, int](), list[str]()
+    selections, refused = list[Selection](), list[str]()
     for i, name in enumerate(names):
         report(i / len(names), f"removing the support from {name}")
         if any(edit.plane is not None for edit in load_edits(session, name).active):
@@ -203,11 +203,12 @@ def remove_support(session: Session, names: list[str], report: Reporter, warn: W
         try:
             cloud = used_points(session, whole_cloud(session, name))
             plane, selected = select_support(cloud.points, cloud.sigma_z)
-            deleted[name] = delete_points(session.guarded(report.saving), name, cloud.points, selected, SUPPORT, plane)
+            selections.append(Selection(name, cloud.points, selected, plane))
         except InputError as error:
             refused.append(f"{name}: {error}")
-    if not deleted:
+    if not selections:
         raise InputError("; ".join(refused) or "no scan is reconstructed yet")
+    deleted = delete_points(session.guarded(report.saving), selections, SUPPORT)
     for reason in refused:
         warn(reason)
     report(1.0, "support removed")

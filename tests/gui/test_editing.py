@@ -38,12 +38,12 @@ def capture_scans(folder: Path, world: SimulatedWorld, angles_deg: dict[str, flo
 
 @pytest.fixture
 def wizard(tmp_path: Path, browser: Browser) -> Iterator[tuple[Opened, App, Operator]]:
-    """A page in the step Scan of a session with one reconstructed scan, without a rig."""
+    """A page in the step Scan of a session with two scans, of which the first is reconstructed, without a rig."""
     folder, rig = tmp_path / "session", letter(0.25)
     true_calibration(folder, rig)
     world = SimulatedWorld(rig)
     world.place("object")
-    capture_scans(folder, world, {"one": 0.0})
+    capture_scans(folder, world, {"one": 0.0, "two": 0.0})
     with Operator(folder) as operator:
         operator.reconstruct("one")
         operator.wait_until_idle()
@@ -131,6 +131,44 @@ def test_points_are_selected_deleted_and_brought_back(wizard: tuple[Opened, App,
     expect(page.get_by_text(re.compile("points shown; the file has all"))).to_be_visible()
     button(page, "Redo edit").click()
     wait_until(page, lambda: len(operator.snapshot().scan("one").edits) == 1)  # type: ignore[union-attr]
+    assert cut_labels(page) == []
+    assert opened.errors == []
+
+
+def test_points_of_two_scans_are_deleted_and_brought_back_in_the_step_merge(
+    wizard: tuple[Opened, App, Operator],
+) -> None:
+    opened, app, operator = wizard
+    page = opened.page
+    operator.reconstruct("two")
+    operator.wait_until_idle()
+    assert operator.session is not None
+    points = whole_cloud(operator.session, "one").points
+    button(page, "7. Merge").click()
+    expect(button(page, "Merge 2 scans")).to_be_visible()
+    unfold(page, "Edit points")
+    choose(page, "Select by", "lasso")
+    page.wait_for_timeout(1500)  # the view moves to the clouds
+    valid = np.argwhere(np.isfinite(points[..., 2]))
+    v, u = valid[np.argmin(np.abs(valid - np.median(valid, axis=0)).sum(axis=1))]
+    x, y = to_screen(app, page, points[v, u])
+    for dx, dy in ((-30, -30), (30, -30), (30, 30), (-30, 30)):
+        page.mouse.click(x + dx, y + dy)
+        page.wait_for_timeout(400)
+    button(page, "Close outline").click()
+    wait_until(page, lambda: count_selected(page) > 0)
+    selected = count_selected(page)
+
+    def edits() -> list[int]:
+        return [len(operator.snapshot().scan(name).edits) for name in ("one", "two")]  # type: ignore[union-attr]
+
+    button(page, "Delete selected").click()
+    wait_until(page, lambda: edits() == [1, 1])
+    assert sum(load_edits(operator.session, name).active[0].points for name in ("one", "two")) == selected
+    button(page, "Undo edit").click()
+    wait_until(page, lambda: edits() == [0, 0])
+    button(page, "Redo edit").click()
+    wait_until(page, lambda: edits() == [1, 1])
     assert cut_labels(page) == []
     assert opened.errors == []
 

@@ -8,6 +8,7 @@ import pytest
 from slviewer.devices.simulated import simulated_rig
 from slviewer.devices.world import SimulatedWorld
 from slviewer.pipeline.capture import capture
+from slviewer.pipeline.edit import Selection
 from slviewer.pipeline.merge import merge
 from slviewer.pipeline.rig_choice import RigSetup
 from slviewer.simulation.rig import letter
@@ -49,7 +50,7 @@ def test_edits_and_region_change_what_is_measured_and_merged(operator: Operator)
     points = whole_cloud(store, "one").points
     total = int(np.isfinite(points[..., 2]).sum())
     nearer = points[..., 2] < np.nanmedian(points[..., 2])
-    assert operator.delete_points("one", points, nearer, "the nearer half")
+    assert operator.delete_points([Selection("one", points, nearer)], "the nearer half")
     session = view(operator)
     assert session.merge is not None and session.merge.stale
     assert len(session.scans[0].edits) == 1 and session.scans[0].cloud == "fresh"
@@ -61,7 +62,7 @@ def test_edits_and_region_change_what_is_measured_and_merged(operator: Operator)
     assert session.merge is not None and not session.merge.stale
     assert operator.surface("one").measured.sum() == total
     plane = SupportPlane((0.0, 0.0, -1.0), -float(np.nanmedian(points[..., 2])), 0.0)
-    assert operator.delete_points("one", points, plane.select_below(points), "support", plane)
+    assert operator.delete_points([Selection("one", points, plane.select_below(points), plane)], "support")
     assert operator.surface("one").measured.sum() < 0.6 * total
     assert operator.undo_edit("one") and not operator.undo_edit("one") and operator.redo_edit("one")
     assert operator.fit_region("one") and operator.switch_region(False)
@@ -75,8 +76,8 @@ def test_what_leaves_nothing_is_refused_with_numbers(operator: Operator) -> None
     points = whole_cloud(store, "one").points
     everything = np.ones(points.shape[:2], bool)
     assert not operator.switch_region(True)
-    assert not operator.delete_points("one", points, everything, "everything")
-    assert not operator.delete_points("one", points, ~everything, "nothing")
+    assert not operator.delete_points([Selection("one", points, everything)], "everything")
+    assert not operator.delete_points([Selection("one", points, ~everything)], "nothing")
     assert not operator.redo_edit("one")
     assert operator.set_region(FAR)
     operator.reconstruct("two")
@@ -86,3 +87,31 @@ def test_what_leaves_nothing_is_refused_with_numbers(operator: Operator) -> None
     assert operator.switch_region(False)
     operator.reconstruct("two")
     assert view(operator).scans[1].cloud == "fresh"
+
+
+def test_edits_of_several_scans_are_made_and_undone_together(operator: Operator) -> None:
+    operator.reconstruct("two")
+    view(operator)
+    store = operator.session
+    assert store is not None
+
+    def counts() -> list[tuple[int, int]]:
+        return [(len(scan.edits), scan.undone_edits) for scan in view(operator).scans]
+
+    clouds = {name: whole_cloud(store, name).points for name in ("one", "two")}
+    halves = {name: points[..., 0] < np.nanmedian(points[..., 0]) for name, points in clouds.items()}
+    assert operator.delete_points([Selection(name, clouds[name], halves[name]) for name in clouds], "left")
+    upper = clouds["two"][..., 1] < np.nanmedian(clouds["two"][..., 1])
+    nothing = np.zeros_like(upper)
+    assert operator.delete_points(
+        [Selection("one", clouds["one"], nothing), Selection("two", clouds["two"], upper)], "up"
+    )
+    assert counts() == [(1, 0), (2, 0)]
+    assert operator.undo_edit("one", "two") and counts() == [(1, 0), (1, 1)]
+    assert operator.undo_edit("one", "two") and counts() == [(0, 1), (0, 2)]
+    assert not operator.undo_edit("one", "two")
+    assert operator.redo_edit("one", "two") and counts() == [(1, 0), (1, 1)]
+    assert operator.redo_edit("one", "two") and counts() == [(1, 0), (2, 0)]
+    everything = np.ones_like(upper)
+    selections = [Selection("one", clouds["one"], upper), Selection("two", clouds["two"], everything)]
+    assert not operator.delete_points(selections, "too much") and counts() == [(1, 0), (2, 0)]

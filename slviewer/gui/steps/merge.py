@@ -11,11 +11,12 @@ from slviewer.gui.merge_html import merge_failure_html, merge_html, turntable_ht
 from slviewer.gui.merge_picking import PointPicker
 from slviewer.gui.merge_views import AFTER, BEFORE, MERGED, SHOWN, ColouredClouds, colour_merge, colour_scans
 from slviewer.gui.panel import PanelContext, StepPanel
+from slviewer.gui.point_editing import PointEditing
 from slviewer.gui.steps.verify import shape_of
 from slviewer.gui.widgets import Text
 from slviewer.wizard.snapshot import MergeView, ScanView, SessionView, Snapshot
 
-LAYER = "merge"
+LAYER, EDITS = "merge", "merge edits"
 FEATURES, MARKERS, PLACED, TURNTABLE = "features", "markers", "places while scanning", "turntable"
 CURRENT, PICKED = "current position", "picked points"
 STARTS = (FEATURES, MARKERS, PLACED, TURNTABLE, CURRENT, PICKED)
@@ -67,6 +68,7 @@ class Panel(StepPanel):
         self._view.on_change(context.callback(self._refresh))
         self._legend = Text(gui)
         context.view_button(self._get_shown_points)
+        self._editing = PointEditing(context, EDITS, self._redraw)
 
     def draw(self, snapshot: Snapshot) -> None:
         """Show the scans and the merge of a snapshot."""
@@ -199,6 +201,9 @@ class Panel(StepPanel):
             self._picker.offer(chosen, self._reference.value, labels, start == PICKED)
             ready = len(names) > 1 and (start != PICKED or self._picker.is_ready)
             change(self._merge, label=f"Merge {len(names)} scans", disabled=snapshot.is_busy or not ready)
+            shown = self._list_shown(session, names, versions)
+            editable = self._view.value not in MERGED and not self._is_picking
+            self._editing.draw([scan for scan in session.scans if scan.name in shown] if editable else [])
             self._show_layers()
             if not self._is_picking:
                 self._request_clouds(session, names, versions, labels)
@@ -208,7 +213,7 @@ class Panel(StepPanel):
     ) -> None:
         """Request the clouds of the chosen view."""
         merge, view, context = session.merge, self._view.value, self._context
-        shown = [name for name in (merge.scans if merge is not None else names) if name in versions]
+        shown = self._list_shown(session, names, versions)
         poses = {name: pair[2] for name, pair in merge.pairs.items()} if merge is not None and view == AFTER else {}
         key = (
             view,
@@ -225,11 +230,21 @@ class Panel(StepPanel):
 
         self._painter.request("clouds", key, make, self._draw_clouds)
 
+    def _list_shown(self, session: SessionView, names: list[str], versions: Mapping[str, Any]) -> list[str]:
+        """List the scans in the 3D view: those of the merge, else those to merge."""
+        return [name for name in (session.merge.scans if session.merge is not None else names) if name in versions]
+
+    def _redraw(self) -> None:
+        """Draw the clouds again, as other points of them are hidden."""
+        if self._clouds is not None:
+            self._draw_clouds(self._clouds)
+
     def _draw_clouds(self, clouds: ColouredClouds) -> None:
         """Draw the loaded clouds, and remove others."""
         for name in set(self._scene.names(LAYER)) - set(clouds.clouds):
             self._scene.remove(LAYER, name)
-        for name, (points, painted) in clouds.clouds.items():
+        shown = self._editing.set_scans(clouds.scans) or [points for points, _ in clouds.clouds.values()]
+        for points, (name, (_, painted)) in zip(shown, clouds.clouds.items(), strict=True):
             self._scene.cloud(LAYER, name, points, painted, SHOWN)
         with self._lock:
             self._clouds = clouds
@@ -241,8 +256,12 @@ class Panel(StepPanel):
         shown = self._visible and not picking
         if self._layer_shown != shown:
             self._layer_shown = shown
-            self._scene.show(LAYER, shown)
+            for layer in (LAYER, EDITS):
+                self._scene.show(layer, shown)
+        if picking:  # the one that stops taking clicks comes first
+            self._editing.show(False)
         self._picker.show(self._visible and picking)
+        self._editing.show(shown)
         self._legend.set("" if picking or self._clouds is None else self._clouds.legend)
         if shown and self._clouds is not None:
             self._context.viewpoints.show(f"{LAYER} {self._clouds.view}", self._clouds.points)

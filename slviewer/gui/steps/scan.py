@@ -216,7 +216,7 @@ class Panel(StepPanel):
         """Remove the captured cloud with its legend and picked point."""
         self._painter.cancel("cloud")
         self._cloud = self._whole = None
-        self._editing.set_cloud(None)
+        self._editing.set_scans([])
         for name in ("cloud", "picked"):
             self._scene.remove(LAYER, name)
         self._legend.set("")
@@ -233,7 +233,7 @@ class Panel(StepPanel):
             change(self._reconstruct, disabled=self._snapshot.is_busy, label=label)
             self._figures.set(scan_html(scan))
             self._region.draw(session, scan.name if scan.cloud != "absent" else "")
-            self._editing.draw(scan)
+            self._editing.draw([scan])
             self._draw_placement(scan, self._snapshot.is_busy)
             shown = len(self._shown_scans())
             label = "Remove support" if shown == 1 else f"Remove support, {shown} scans"
@@ -299,7 +299,7 @@ class Panel(StepPanel):
         if self._is_live:
             return
         self._cloud = self._whole = None
-        self._editing.set_cloud(None)
+        self._editing.set_scans([])
         self._scene.remove(LAYER, "picked")
         self._point.set("")
         painted = np.where(aligned.seen_by[:, None] > 1, SEEN_AGAIN, SEEN_ONCE)
@@ -325,8 +325,7 @@ class Panel(StepPanel):
         is_new = whole is not self._whole
         self._whole, self._cloud = whole, cloud
         painted, bar = painting(cloud, colour)
-        points = self._editing.set_cloud(cloud)
-        assert points is not None
+        (points,) = self._editing.set_scans([(cloud, None)])
         shown = self._scene.cloud(LAYER, "cloud", points, painted)
         self._scene.show(LAYER, self._visible)
         removed = int(whole.measured_count - cloud.measured_count)
