@@ -1,9 +1,11 @@
 """Form, orientation, location and profile by ISO 1101: widths of tolerance zones, with their uncertainty.
 
-Noise widens any range of measured points. A zone's width is therefore read off the smooth part of the deviations, the
-polynomials up to degree `DEGREE` across the region, as a filter's cutoff does in ISO 12181 and ISO 12781. What noise
-still adds to the width of the smooth part is estimated by adding it once more (`DRAWS` draws) and subtracted; both the
-spread of these draws and the whole of what was subtracted are part of U, so that a perfect part is covered too.
+Noise widens any range of measured points. A zone's width is therefore not read off the points, but estimated from the
+deviations' polynomials up to degree `DEGREE` across the region, as a filter's cutoff does in ISO 12181 and ISO 12781.
+The polynomials of one degree are taken for normally distributed with one variance, whose prior is half-Cauchy with the
+noise as its scale (Gelman 2006): degrees that show nothing but noise shrink, those that show form do not. The width is
+that of the mean of `DRAWS` draws of the polynomials, and the spread of the draws' widths is its uncertainty. Where the
+deviations as a whole are no larger than noise makes them, U is at least the width: a perfect part is covered too.
 Reference features are those of least squares (GG), whose zones are never narrower than the minimum zones of ISO 1101.
 """
 
@@ -13,7 +15,9 @@ from itertools import product
 from typing import Literal, get_args
 
 import numpy as np
+from scipy.ndimage import uniform_filter
 from scipy.spatial import cKDTree
+from scipy.stats import chi2
 
 from slviewer.errors import InputError
 from slviewer.geometry.cubes import occupied_cubes
@@ -29,16 +33,19 @@ FORM_KINDS: tuple[FormKind, ...] = get_args(FormKind)
 ORIENTATION_KINDS: tuple[OrientationKind, ...] = get_args(OrientationKind)
 DEGREE = 6
 """Of the polynomials across a region that count as form; what is finer is noise or unresolved."""
-MAX_DRAWN_POINTS = 2_000
-MAX_EVEN_POINTS = 5_000
+MAX_DRAWN_POINTS = 5_000
 SPIKE_SIGMA = 5.0
-DENSITY_REACH = 0.3
-"""Of the coordinates across a region, -1 to 1: within it the density of the points is estimated."""
+CELL_POINTS, MAX_CELLS, WINDOW = 5, 24, 5
+"""Of the estimate of the points' density: points a cell at least, cells along a region, and cells that are averaged."""
 PATCH_SIGMA = 4.5
 """Of the mean of a patch: one that is farther off the smooth part shows form that is too fine for it."""
-SPAN_RATIO = 1e-3
-"""Directions of a basis that are this much weaker than its strongest tell nothing: a short arc looks the same along
-them."""
+SPAN_RATIO = 1e-4
+"""Directions of a basis with a smaller root mean square tell nothing: a short arc looks the same along them."""
+LEVEL = 0.95
+"""Of the test whether noise alone explains the deviations."""
+BURN_IN, THINNING = 50, 3
+"""Of the draws of the polynomials' weights: steps before the first, and steps of which one is kept."""
+THIN = 0.01
 POINTS_PER_TERM = 10
 SECTION_SHARE = 0.1
 """Thickness of the section whose roundness is measured, as a share of the region's length along the axis, or of a
@@ -51,15 +58,17 @@ MAX_TILT_DEG = 10.0
 class SmoothDeviations:
     """The smooth part of deviations (n,) mm at ``points`` (n, 3), along ``normals`` (n, 3).
 
-    The smooth part is ``basis @ weights`` (n, r) and (r,); ``noise_mm`` is the standard deviation of one point, and of
-    each weight, ``unresolved_mm`` how far patches lie off the smooth part beyond noise; ``answer`` (r, m) gives
-    the weights by displacements of the ``sampled`` points (m,) along their normals.
+    ``basis @ draws``, (n, r) and (r, DRAWS), are draws of the smooth part; ``is_noise``: whether noise alone explains
+    it. ``noise_mm`` is the standard deviation of one point, and of each weight,
+    ``unresolved_mm`` how far patches lie off the smooth part beyond noise; ``answer`` (r, m) gives the weights by
+    displacements of the ``sampled`` points (m,) along their normals.
     """
 
     points: np.ndarray
     normals: np.ndarray
     basis: np.ndarray
-    weights: np.ndarray
+    draws: np.ndarray
+    is_noise: bool
     noise_mm: float
     unresolved_mm: float
     answer: np.ndarray
@@ -67,23 +76,30 @@ class SmoothDeviations:
 
     @property
     def smooth(self) -> np.ndarray:
-        """(n,) mm: the smooth part."""
-        return np.asarray(self.basis @ self.weights)
+        """(n,) mm: the smooth part, the mean of its draws."""
+        return np.asarray(self.basis @ self.draws.mean(axis=1))
 
 
 def smooth_deviations(
-    deviations: np.ndarray, points: np.ndarray, normals: np.ndarray, coordinates: np.ndarray, fitted: np.ndarray
+    deviations: np.ndarray,
+    points: np.ndarray,
+    normals: np.ndarray,
+    coordinates: np.ndarray,
+    fitted: np.ndarray,
+    unrolled: np.ndarray | None = None,
 ) -> SmoothDeviations:
     """Separate deviations (n,) mm into a smooth part, without what the columns of ``fitted`` (n, p) explain, and noise.
 
-    ``coordinates`` (n, k): across the region, in about -1 to 1. Raises InputError for too few points.
+    ``coordinates`` (n, k): across the region, in about -1 to 1; ``unrolled`` (n, 1 or 2): others that are in proportion
+    to its area, by default the same. Raises InputError for too few points.
     """
     step = -(-len(deviations) // MAX_FITTED_POINTS)
     d, points, normals = deviations[::step], points[::step], normals[::step]
+    unrolled = (coordinates if unrolled is None else unrolled)[::step]
     coordinates, fitted = coordinates[::step], fitted[::step]
     counted = np.ones(len(d), bool)
     for _ in range(2):
-        removed, basis = _smooth_basis(coordinates[counted], fitted[counted])
+        removed, basis, degrees = _smooth_basis(coordinates[counted], fitted[counted])
         n, r = basis.shape
         if n < POINTS_PER_TERM * (r + removed.shape[1]):
             raise InputError(
@@ -99,7 +115,7 @@ def smooth_deviations(
         counted[np.flatnonzero(counted)[~within]] = False
     d, points, normals, coordinates = d[counted], points[counted], normals[counted], coordinates[counted]
     if len(d) < n:
-        removed, basis = _smooth_basis(coordinates, fitted[counted])
+        removed, basis, degrees = _smooth_basis(coordinates, fitted[counted])
         whole = np.hstack([removed, basis])
         residuals = d - whole @ (whole.T @ d)
     n, columns = whole.shape
@@ -108,12 +124,15 @@ def smooth_deviations(
     sampled = np.arange(0, n, -(-n // MAX_SHARED_POINTS))
     answer = np.linalg.pinv(whole[sampled], rcond=1e-6)
     # the reference is that of even weight by area, whatever the density of the points
-    even = np.arange(0, n, -(-n // MAX_EVEN_POINTS))
-    near = cKDTree(coordinates[even]).query_ball_point(coordinates[even], DENSITY_REACH, return_length=True)
-    root = 1 / np.sqrt(near)[:, None]
-    reference = np.linalg.lstsq(root * removed[even], root * whole[even], rcond=1e-6)[0]
+    root = np.sqrt(_even_weights(unrolled[counted]))[:, None]
+    reference = np.linalg.lstsq(root * removed, root * whole, rcond=1e-6)[0]
     smooth = whole - removed @ reference
-    return SmoothDeviations(points, normals, smooth, whole.T @ d, factor * noise, unresolved, answer, sampled)
+    weights, noise = whole.T @ d, factor * noise
+    form = weights[removed.shape[1] :]
+    draws = np.repeat(weights[:, None], DRAWS, axis=1)
+    draws[removed.shape[1] :] = _draw_weights(form, degrees, noise, np.random.default_rng(0))
+    is_noise = bool(form @ form <= noise**2 * chi2.ppf(LEVEL, max(len(form), 1)))
+    return SmoothDeviations(points, normals, smooth, draws, is_noise, noise, unresolved, answer, sampled)
 
 
 def zone_width(
@@ -123,19 +142,18 @@ def zone_width(
     shared: Shared | None = None,
     displaced: Callable[[np.ndarray], np.ndarray] | None = None,
 ) -> Quantity:
-    """The width (mm) of a zone that holds the smooth part, with the contribution of noise subtracted and inside U.
+    """The width (mm) of a zone that holds the smooth part, with the spread of its draws in U.
 
     ``width``: of deviations (n, draws), for each draw; ``displaced``: draws of further deviations (n, draws) at points
     (n, 3), as a datum's or an alignment's errors cause.
     """
     field = smooth.smooth
     chosen = np.unique([*range(0, len(field), -(-len(field) // MAX_DRAWN_POINTS)), field.argmin(), field.argmax()])
-    value = float(width(field[:, None])[0])
-    drawn = smooth.basis[chosen] @ np.random.default_rng(0).normal(size=(smooth.basis.shape[1], DRAWS))
-    drawn = field[chosen, None] + smooth.noise_mm * drawn
+    drawn = smooth.basis[chosen] @ smooth.draws
     if displaced is not None:
         drawn = drawn + displaced(smooth.points[chosen])
-    variance = smooth.unresolved_mm**2
+    widths, value = width(drawn), float(width(field[:, None])[0])
+    variance = float(widths.var()) + smooth.unresolved_mm**2
     if shared is not None:
         # where the zone touches, its width answers to the deviations there; the rest of the field leaves it unchanged
         change = 1e-3 * smooth.noise_mm + 1e-9
@@ -147,8 +165,9 @@ def zone_width(
         answers = (by_field @ smooth.basis) @ smooth.answer
         places = smooth.sampled
         variance += float(np.sum(shared(smooth.points[places], answers[None, :, None] * smooth.normals[places]) ** 2))
-    wider = field[chosen, None] + np.sqrt(2) * (drawn - field[chosen, None])
-    return _correct_for_noise(name, value, width(drawn), variance, shared is not None, width(wider))
+    # what the draws' scatter adds to the width bounds by how much the mean's own scatter may have widened it
+    sigma = float(np.sqrt(variance + (widths.mean() - value) ** 2 / 3))
+    return Quantity(name, value, "mm", max(sigma, value / 2) if smooth.is_noise else sigma, shared is not None)
 
 
 def form_error(kind: FormKind, fit: FeatureFit, points: np.ndarray, shared: Shared | None = None) -> Quantity:
@@ -169,11 +188,16 @@ def form_error(kind: FormKind, fit: FeatureFit, points: np.ndarray, shared: Shar
         across = normals - (normals @ axis)[:, None] * axis
         coordinates = across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-12)
         fitted = np.column_stack([coordinates, np.ones(len(points))])  # a circle: a thin section shows no tilt
+        first = coordinates[0]
+        unrolled = np.arctan2(coordinates @ np.cross(axis, first), coordinates @ first)[:, None]
     else:
         normals = f.normals(points)
         coordinates = _region_coordinates(points) if f.kind == "plane" else _cylinder_coordinates(f, points)
         fitted = f.jacobian(points)
-    smooth = smooth_deviations(f.distance(points), points, normals, coordinates, fitted)
+        unrolled = coordinates
+        if f.kind == "cylinder":
+            unrolled = np.column_stack([np.arctan2(coordinates[:, 1], coordinates[:, 0]), coordinates[:, 2]])
+    smooth = smooth_deviations(f.distance(points), points, normals, coordinates, fitted, unrolled)
     return zone_width(kind, smooth, lambda d: np.ptp(d, axis=0), shared)
 
 
@@ -267,7 +291,7 @@ def position_error(
 
     shifts = np.zeros((DRAWS, len(reached), 3)) if moves is None else moves(f.place + reached)
     drawn = np.array([off(f.moved(step), shift) for step, shift in zip(steps, shifts, strict=True)])
-    return _correct_for_noise("position", off(f, 0.0), drawn, 0.0, fit.spread.shared is not None)
+    return _correct_for_noise("position", off(f, 0.0), drawn, fit.spread.shared is not None)
 
 
 def profile_error(
@@ -283,7 +307,7 @@ def profile_error(
     points, deviations, normals = (np.asarray(each[counted], np.float64) for each in (points, deviations, normals))
     if not len(points):
         raise InputError("No point of the region belongs to the nominal: select a region on it.")
-    coordinates = _region_coordinates(points, axes=3)
+    coordinates = _region_coordinates(points - deviations[:, None] * normals, axes=3)  # on the nominal: without noise
     smooth = smooth_deviations(deviations, points, normals, coordinates, np.zeros((len(points), 0)))
     moves = None if alignment is None else alignment.draw(np.random.default_rng(3))
 
@@ -302,22 +326,39 @@ def profile_error(
     )
 
 
-def _correct_for_noise(
-    name: str, value: float, drawn: np.ndarray, variance: float, whole: bool, wider: np.ndarray | None = None
-) -> Quantity:
+def _correct_for_noise(name: str, value: float, drawn: np.ndarray, whole: bool) -> Quantity:
     """Return a width (mm) less what noise adds to it, with that and the spread of the draws in U.
 
-    The measured width holds noise once, the ``drawn`` ones (draws,) twice, and ``wider`` three times in variance: these
-    are extrapolated to none (SIMEX, Cook and Stefanski 1994), by a line without ``wider``, else by a parabola.
+    The measured width holds noise once, the ``drawn`` ones (draws,) twice: they are extrapolated to none by a line
+    (SIMEX, Cook and Stefanski 1994).
     """
-    added = float(drawn.mean() - value)
-    if wider is not None:
-        added = max(added, float(3 * drawn.mean() - 2 * value - wider.mean()))
-    added = min(added, value)
-    # where the form is no larger than what noise adds, all of it may be noise
+    added = min(float(drawn.mean() - value), value)
+    # where the width is no larger than what noise adds, all of it may be noise
     share = min(max(1 / 3, abs(added) / max(value - added, 1e-12)), 0.7)
-    sigma = float(np.sqrt(drawn.var() + share * added**2 + variance))
+    sigma = float(np.sqrt(drawn.var() + share * added**2))
     return Quantity(name, max(value - added, 0.0), "mm", sigma, whole)
+
+
+def _draw_weights(weights: np.ndarray, degrees: np.ndarray, noise: float, rng: np.random.Generator) -> np.ndarray:
+    """Draw what weights (r,), measured with ``noise``, are without it: (r, DRAWS), by Gibbs sampling.
+
+    Weights of one of the ``degrees`` (r,) share a variance with a half-Cauchy prior of scale ``noise``, as a mixture of
+    inverse gamma distributions (Wand et al. 2011).
+    """
+    if not noise > 0 or not len(weights):
+        return np.repeat(weights[:, None], DRAWS, axis=1)
+    _, group, sizes = np.unique(degrees, return_inverse=True, return_counts=True)
+    measured, drawn = weights / noise, np.empty((len(weights), DRAWS))
+    variance = np.maximum(np.bincount(group, measured**2) / sizes, 1.0)
+    for step in range(-BURN_IN, DRAWS * THINNING):
+        kept = (variance / (1 + variance))[group]
+        each = kept * measured + np.sqrt(kept) * rng.normal(size=len(weights))
+        mixture = 1 / rng.gamma(1.0, 1 / (1 + 1 / variance))
+        rate = np.bincount(group, each**2) / 2 + 1 / mixture
+        variance = rate / rng.gamma((sizes + 1) / 2)
+        if step >= 0 and step % THINNING == 0:
+            drawn[:, step // THINNING] = noise * each
+    return drawn
 
 
 def _axis_orientation(
@@ -337,23 +378,46 @@ def _axis_orientation(
     p = f.parameters
     drawn = np.array([off(f.moved(step[:p]), d.moved(step[p:])) for step in steps])
     whole = fit.spread.shared is not None and datum.spread.shared is not None
-    return _correct_for_noise(kind, off(f, d), drawn, 0.0, whole)
+    return _correct_for_noise(kind, off(f, d), drawn, whole)
 
 
-def _smooth_basis(coordinates: np.ndarray, fitted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Orthonormal columns (n, q) of what was fitted, and (n, r) of the polynomials without that."""
-    powers = [e for e in product(range(DEGREE + 1), repeat=coordinates.shape[1]) if sum(e) <= DEGREE]
-    terms = np.stack([np.prod(coordinates ** np.array(e), axis=1) for e in powers], axis=1)
-    removed = _span(fitted / np.maximum(np.linalg.norm(fitted, axis=0), 1e-300))
-    return removed, _span(terms - removed @ (removed.T @ terms))
+def _smooth_basis(coordinates: np.ndarray, fitted: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Orthonormal columns (n, q) of what was fitted, and (n, r) of the polynomials without that, by rising degree, with
+    the degree of each (r,)."""
+    removed = _span(fitted / np.maximum(np.sqrt(np.mean(fitted**2, axis=0)), 1e-300))
+    whole, degrees = removed, list[int]()
+    for degree in range(DEGREE + 1):
+        powers = [e for e in product(range(degree + 1), repeat=coordinates.shape[1]) if sum(e) == degree]
+        terms = np.stack([np.prod(coordinates ** np.array(e), axis=1) for e in powers], axis=1)
+        added = _span(terms, whole)
+        whole = np.hstack([whole, added])
+        degrees += [degree] * added.shape[1]
+    return removed, whole[:, removed.shape[1] :], np.array(degrees)
 
 
-def _span(columns: np.ndarray) -> np.ndarray:
-    """Orthonormal columns (n, r) that span those given, without directions that rounding alone distinguishes."""
+def _span(columns: np.ndarray, without: np.ndarray | None = None) -> np.ndarray:
+    """Orthonormal columns (n, r) that span those given, ``without`` what other orthonormal ones (n, q) span, and
+    without directions that rounding alone distinguishes."""
     if not columns.shape[1]:
         return columns
+    columns = columns / np.sqrt(len(columns))
+    if without is not None:
+        for _ in range(2):  # once more, for what rounding left
+            columns = columns - without @ (without.T @ columns)
     vectors, values, _ = np.linalg.svd(columns, full_matrices=False)
-    return np.asarray(vectors[:, values > SPAN_RATIO * max(values[0], 1e-300)])
+    return np.asarray(vectors[:, values > SPAN_RATIO])
+
+
+def _even_weights(unrolled: np.ndarray) -> np.ndarray:
+    """Weights (n,) of points at coordinates (n, k) in proportion to area, so that equal areas weigh the same."""
+    low, size = unrolled.min(axis=0), np.ptp(unrolled, axis=0)
+    cells = int(np.clip((len(unrolled) / CELL_POINTS) ** (1 / unrolled.shape[1]), 1, MAX_CELLS))
+    place = tuple(np.minimum((unrolled - low) / np.where(size > 0, size, 1.0) * cells, cells - 1).astype(int).T)
+    counts = np.zeros((cells,) * len(place))
+    np.add.at(counts, place, 1)
+    # means over the neighbourhood, which only cells with points count for
+    sums, occupied = (uniform_filter(each, WINDOW, mode="constant") for each in (counts, np.sign(counts)))
+    return np.asarray(occupied[place] / sums[place])
 
 
 def _patch_misfit(
@@ -363,9 +427,7 @@ def _patch_misfit(
     some lie off what noise explains."""
     low = coordinates.min(axis=0)
     side = max(float(np.ptp(coordinates, axis=0).max()) / PATCHES, 1e-12)
-    padded = np.zeros((len(coordinates), 3))
-    padded[:, : coordinates.shape[1]] = coordinates - low
-    cubes, patch = occupied_cubes(padded, side)
+    cubes, patch = occupied_cubes(_pad(coordinates - low), side)
     counts = np.bincount(patch, minlength=len(cubes))
     means = np.bincount(patch, residuals, len(cubes)) / np.maximum(counts, 1)
     large = counts >= POINTS_PER_TERM
@@ -381,13 +443,21 @@ def _patch_misfit(
     return factor, 2 * float(np.abs(means[large])[worst]) if beyond[worst] > 0 else 0.0
 
 
+def _pad(coordinates: np.ndarray) -> np.ndarray:
+    """Coordinates (n, k) as (n, 3), with zeros."""
+    return np.pad(coordinates, ((0, 0), (0, 3 - coordinates.shape[1])))
+
+
 def _region_coordinates(points: np.ndarray, axes: int = 2) -> np.ndarray:
-    """Coordinates (n, axes) of points along their principal axes, in -1 to 1."""
+    """Coordinates (n, axes) of points along their principal axes, each in -1 to 1; 0 along those in which the region is
+    thinner than `THIN` of its length."""
     offsets = points - points.mean(axis=0)
     _, directions = np.linalg.eigh(offsets.T @ offsets)
     along = offsets @ directions[:, ::-1][:, :axes]
     low, high = along.min(axis=0), along.max(axis=0)
-    return np.asarray((2 * along - low - high) / max(float((high - low).max()), 1e-12))
+    size = high - low
+    scaled = (2 * along - low - high) / np.maximum(size, 1e-300)
+    return np.where(size > THIN * size.max(), scaled, 0.0)
 
 
 def _cylinder_coordinates(f: Feature, points: np.ndarray) -> np.ndarray:

@@ -1,6 +1,6 @@
 """An inspection plan on many parts: the table of part by characteristic, capability, and the files of both."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ from slviewer.inspection.parts import PartResult
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings, part
 from slviewer.pipeline.measured_surface import MERGED, MeasuredSurface, load_surface
 from slviewer.pipeline.models import ModelName
-from slviewer.pipeline.open_session import match_names, opened
+from slviewer.pipeline.open_session import match_names, next_number, opened
 from slviewer.pipeline.part_inspection import fail_part, inspect_part
 from slviewer.printable import format_csv
 from slviewer.records import to_plain
@@ -22,6 +22,7 @@ from slviewer.session.atomic import replace_file, to_json
 from slviewer.session.inspection_plan import Plan, read_plan
 from slviewer.session.layout import is_session
 from slviewer.session.nominal import read_nominal
+from slviewer.session.store import Session
 
 RULE = (
     "decided with a guard band as in ISO 14253-1: pass where the value and its expanded uncertainty U (k = 2) stay "
@@ -178,6 +179,17 @@ def inspect_surfaces(
             results.append(fail_part(name, plan, str(error)))
     progress(1.0, "inspected")
     return Inspection(plan, tuple(results))
+
+
+def save_inspection(store: Session, inspection: Inspection, inputs: Mapping[str, str]) -> None:
+    """Save the results as `inspection/<number>`, which is stale once one of the ``inputs``, {name: hash}, changes."""
+    meta = {
+        "plan": inspection.plan.name,
+        "characteristic": to_plain(inspection.plan.characteristic),
+        "parts": to_plain(inspection.parts),
+        "inputs": dict(inputs),
+    }
+    store.save_result(f"inspection/{next_number(store, 'inspection')}", meta, {})
 
 
 def write_inspection(inspection: Inspection, folder: Path) -> Inspection:

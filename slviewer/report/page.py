@@ -153,13 +153,14 @@ def write_page(
     headlines: Sequence[Headline | tuple[str, str, str]],
     sections: Sequence[Section],
     certify: Callable[[str], str] | None = None,
+    frame: str = "in the camera's frame",
 ) -> None:
     """Write the page to ``path``, complete or not at all; every text is shown as typed, never run.
 
-    ``certify``: returns the text of the certificate that the page keeps, given its digest. Raises InputError where the
-    file cannot be written.
+    ``frame``: in what coordinates places are; ``certify``: returns the text of the certificate that the page keeps,
+    given its digest. Raises InputError where the file cannot be written.
     """
-    page = _render(title, subtitle, [Headline(*headline) for headline in headlines], sections)
+    page = _render(title, subtitle, [Headline(*headline) for headline in headlines], sections, frame)
     if certify is not None:
         kept = f'<template id="certificate">{html.escape(certify(page_digest(page)))}</template>'
         page = page.replace("</body>", f"{kept}</body>")
@@ -185,7 +186,7 @@ def page_digest(page: str) -> str:
     return hashlib.blake2b(body.encode(), digest_size=20).hexdigest()
 
 
-def _render(title: str, subtitle: str, headlines: Sequence[Headline], sections: Sequence[Section]) -> str:
+def _render(title: str, subtitle: str, headlines: Sequence[Headline], sections: Sequence[Section], frame: str) -> str:
     """The page as HTML, from the template."""
     from jinja2 import Environment, StrictUndefined
     from markupsafe import Markup
@@ -213,5 +214,6 @@ def _render(title: str, subtitle: str, headlines: Sequence[Headline], sections: 
         sections=sections,
         style=Markup((here / "page.css").read_text(encoding="utf-8")),  # noqa: S704, ours, not a user's
         version=__version__,
+        frame=frame,
         written=datetime.now().strftime("%Y-%m-%d %H:%M"),
     )

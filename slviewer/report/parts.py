@@ -7,6 +7,7 @@ import numpy as np
 
 from slviewer.evaluation.acceptance.figures import Decision
 from slviewer.evaluation.capability import Capability
+from slviewer.evaluation.render import format_count
 from slviewer.inspection.parts import CharacteristicResult, PartResult
 from slviewer.report.canvas import HALF, INK, SOFT, finish_figure, new_figure, style_axes
 from slviewer.report.page import Cell, Column, Figure, Headline, Mark, PageNotice, Section, Table, write_page
@@ -54,7 +55,9 @@ def write_parts_page(
     ]
     if reasons:
         sections.insert(1, Section("Not measured", "", reasons))
-    write_page(path, f"Inspection: {plan.name}", f"{len(plan.characteristic)} characteristics", headlines, sections)
+    subtitle = format_count(len(plan.characteristic), "characteristic")
+    frame = "in the camera's frame" if plan.alignment.kind == "none" else "in part coordinates"
+    write_page(path, f"Inspection: {plan.name}", subtitle, headlines, sections, frame=frame)
 
 
 def _headline_mark(decision: Decision, count: int) -> Mark:

@@ -17,6 +17,8 @@ from slviewer.session.reading import read_toml
 from slviewer.session.toml import table_lines
 
 VERSION = 1
+PLANS, OWN_PLAN = "plans", "exports/plan.toml"
+"""Of a session: folder with the plans that were uploaded, and the plan that was made in it."""
 SIZES = ("radius", "diameter")
 FORMS = ("flatness", "roundness", "cylindricity")
 TO_DATUM = ("parallelism", "perpendicularity")
@@ -166,6 +168,12 @@ def read_plan(path: Path | str) -> Plan:
         return plan
     nominal = Path(path).expanduser().absolute().parent / plan.alignment.nominal
     return replace(plan, alignment=replace(plan.alignment, nominal=str(nominal)))
+
+
+def list_plans(session: Path) -> tuple[str, ...]:
+    """List the plans in a session's folder: paths in it, that of the plan made there first."""
+    own = [OWN_PLAN] if (session / OWN_PLAN).is_file() else []
+    return (*own, *sorted(f"{PLANS}/{each.name}" for each in (session / PLANS).glob("[!.]*.toml")))
 
 
 def write_plan(plan: Plan, path: Path | str) -> None:

@@ -267,6 +267,14 @@ class _Measurement(ResultMeta, total=False):
     of: list[str]
 
 
+class _Inspection(ResultMeta, total=False):
+    """`inspection/*`."""
+
+    plan: Required[str]
+    characteristic: Required[list[dict[str, Any]]]
+    parts: Required[list[dict[str, Any]]]
+
+
 class _DriftCheck(TypedDict):
     """The entries of a drift check that are no figures."""
 
@@ -311,6 +319,7 @@ _TYPES: dict[str, Any] = {
     "merge": _Merge,
     "placement": _Placement,
     "measurements": _Measurement,
+    "inspection": _Inspection,
     "drift": _Drift,
     "acceptance": _Acceptance,
     "scale": _Scale,

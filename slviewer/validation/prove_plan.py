@@ -1,8 +1,12 @@
-"""Whether the uncertainty of each tolerance of a plan covers the truth, on synthesised clouds of known noise."""
+"""Whether the uncertainty of each tolerance of a plan covers the truth, on synthesised clouds of known noise.
+
+Every repeat is another part: its form is drawn anew, of all wavelengths that a region resolves, as machining leaves it.
+"""
 
 from collections.abc import Callable
 
 import numpy as np
+from numpy.polynomial import legendre
 
 from slviewer.inspection.features import Feature
 from slviewer.inspection.fitting import fit_feature
@@ -15,9 +19,14 @@ REPEATS = 200
 NOISE_MM = 0.02
 BAND = (93.0, 97.0)
 """Percent of the repeats in which U (k = 2) must cover the truth."""
-POINTS = 3000
-CENTRE = np.array([0.03, 0.02, 0.01])
-Clouds = tuple[np.ndarray, ...]
+SIDE = 55
+"""Points along either direction of a region, in a grid as a camera sees them."""
+FORM_MM, DECAY = 0.03, 0.7
+"""Of the drawn form: standard deviation of its coarsest components, and the ratio from one degree to the next."""
+DEGREES = range(2, 7)
+TILT = 0.002
+RADIUS, HALF = 10.0, 15.0
+Case = tuple[float, Quantity]
 
 
 def prove_plan(
@@ -25,22 +34,22 @@ def prove_plan(
 ) -> Proof:
     """Measure parts of known form repeatedly, with new noise along the surface's normals; compare U with the errors.
 
-    ``scale``: as a share of the number of points along each direction. Real scans have errors of the calibration too,
-    of which `prove --only uncertainty` judges the prediction.
+    ``scale``: as a share of the number of points along each direction, at least 0.7. Real scans have errors of the
+    calibration too, of which `prove --only uncertainty` judges the prediction.
     """
-    n = int(POINTS * max(scale, 0.7) ** 2)
+    side = int(SIDE * max(scale, 0.7))
     rows, checks = [], []
-    for k, (kind, (truth, make, measure)) in enumerate(CASES.items()):
+    for k, (kind, measure) in enumerate(CASES.items()):
         progress(k / len(CASES), kind)
-        quantities = [measure(make(n, np.random.default_rng([seed, k, i]))) for i in range(repeats)]
-        errors = np.array([q.value - truth for q in quantities])
-        U = np.array([q.U or 0.0 for q in quantities])
+        cases = [measure(side, np.random.default_rng([seed, k, i])) for i in range(repeats)]
+        truths, U = np.array([truth for truth, _ in cases]), np.array([q.U or 0.0 for _, q in cases])
+        errors = np.array([q.value for _, q in cases]) - truths
         covered = 100 * float(np.mean(np.abs(errors) <= U))
         checks.append(BandCheck(kind, f"% of {repeats} repeats covered by U (k = 2)", covered, *BAND))
         rows.append(
             {
                 "characteristic": kind,
-                "true mm": round(truth, 4),
+                "mean true mm": round(float(truths.mean()), 4),
                 "mean error mm": round(float(errors.mean()), 4),
                 "std. dev. mm": round(float(errors.std()), 4),
                 "U / 2 mm": round(float(U.mean()) / 2, 4),
@@ -48,92 +57,112 @@ def prove_plan(
             }
         )
     progress(1.0, "proven")
-    record = {"noise_mm": NOISE_MM, "points": n, "repeats": repeats, "rows": rows}
+    record = {"noise_mm": NOISE_MM, "points": side**2, "repeats": repeats, "rows": rows}
     return prove_checks(checks, scale, rows, record)
 
 
-def make_bowed_plate(n: int, rng: np.random.Generator, noise: float = NOISE_MM) -> Clouds:
-    """A plate of 40 x 40 mm that rises by 0.1 mm from its middle to its corners."""
-    points = rng.uniform(-20, 20, (n, 3))
-    u, v = points[:, 0] / 20, points[:, 1] / 20
-    points[:, 2] = 0.05 * (u**2 + v**2) + noise * rng.normal(size=n)
-    return (points,)
+def draw_form(rng: np.random.Generator, shape: tuple[int, int] = (7, 7)) -> np.ndarray:
+    """Draw the coefficients (k, m) of a form, mm: of degrees `DEGREES` in sum, decaying with the degree."""
+    degree = np.add.outer(np.arange(shape[0]), np.arange(shape[1]))
+    counted = (degree >= DEGREES[0]) & (degree <= DEGREES[-1])
+    return np.where(counted, FORM_MM * DECAY ** (degree - DEGREES[0]) * rng.normal(size=shape), 0.0)
 
 
-def make_tilted_plate(n: int, rng: np.random.Generator) -> Clouds:
-    """A plate that rises by 0.08 mm along x, and a level one below it."""
-    upper, lower = rng.uniform(-20, 20, (2, n, 3))
-    upper[:, 2] = 0.002 * upper[:, 0] + NOISE_MM * rng.normal(size=n)
-    lower[:, 2] = -20 + NOISE_MM * rng.normal(size=n)
-    return upper, lower
+def make_grid(side: int) -> np.ndarray:
+    """Coordinates (side^2, 2) of a grid in -1 to 1."""
+    along = (np.arange(side) + 0.5) / side * 2 - 1
+    return np.stack(np.meshgrid(along, along), axis=-1).reshape(-1, 2)
 
 
-def make_leaning_wall(n: int, rng: np.random.Generator) -> Clouds:
-    """A wall that leans by 0.08 mm over 40 mm, and a level plate below it."""
-    upper, lower = make_tilted_plate(n, rng)
-    return upper[:, [2, 1, 0]], lower[:, [0, 1, 2]]
+def remove_fit(values: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """Values (n,) without what columns (n, p) explain of them by least squares."""
+    return np.asarray(values - columns @ np.linalg.lstsq(columns, values, rcond=None)[0])
 
 
-def make_lobed_cylinder(n: int, rng: np.random.Generator, noise: float = NOISE_MM) -> Clouds:
-    """A cylinder of radius 10 mm and length 30 mm with three lobes of 0.05 mm, which grow towards one end."""
-    t, h = rng.uniform(-np.pi, np.pi, n), rng.uniform(-15, 15, n)
-    r = 10 + 0.05 * (1 + h / 30) * np.cos(3 * t) + noise * rng.normal(size=n)
-    return (np.stack([r * np.cos(t), r * np.sin(t), h], axis=1),)
+def make_plate(side: int, rng: np.random.Generator, tilt: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """Points (n, 3) of a plate of 40 x 40 mm with drawn form, which rises by ``tilt`` along x, and its true heights."""
+    uv = make_grid(side)
+    heights = legendre.legval2d(uv[:, 0], uv[:, 1], draw_form(rng)) + 20 * tilt * uv[:, 0]
+    return np.column_stack([20 * uv, heights + NOISE_MM * rng.normal(size=len(uv))]), heights
 
 
-def make_sphere(n: int, rng: np.random.Generator) -> Clouds:
-    """A cap of a sphere of radius 10 mm about `CENTRE`."""
-    c, t = rng.uniform(np.cos(1.0), 1, n), rng.uniform(0, 2 * np.pi, n)
+def make_cylinder(side: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points (n, 3) of a cylinder with drawn form: waves about its axis that change along it; their angles and places
+    along it (n, 2), -1 to 1, and true deviations (n,)."""
+    uv = make_grid(side)
+    angles = np.pi * uv[:, 0]
+    along = legendre.legvander(uv[:, 1], 6)
+    form = np.zeros(len(uv))
+    for wave in (np.cos, np.sin):
+        waves = wave(np.outer(angles, np.arange(7)))
+        form += np.einsum("nk,km,nm->n", waves, draw_form(rng), along)
+    r = RADIUS + form + NOISE_MM * rng.normal(size=len(uv))
+    return np.stack([r * np.cos(angles), r * np.sin(angles), HALF * uv[:, 1]], axis=1), uv, form
+
+
+def _flatness(side: int, rng: np.random.Generator) -> Case:
+    """The flatness of a plate."""
+    points, heights = make_plate(side, rng)
+    truth = np.ptp(remove_fit(heights, np.column_stack([points[:, :2], np.ones(len(points))])))
+    return float(truth), form_error("flatness", fit_feature("plane", points), points)
+
+
+def _roundness(side: int, rng: np.random.Generator) -> Case:
+    """The roundness of a thin ring, which has the form of one section."""
+    angles = np.pi * make_grid(side)[:, 0]
+    harmonics, amplitudes = np.arange(2, 7), FORM_MM * DECAY ** np.arange(5)
+    form = np.zeros(len(angles))
+    for wave in (np.cos, np.sin):
+        form += wave(np.outer(angles, harmonics)) @ (amplitudes * rng.normal(size=5))
+    r = RADIUS + form + NOISE_MM * rng.normal(size=len(form))
+    points = np.stack([r * np.cos(angles), r * np.sin(angles), HALF * make_grid(side)[:, 1]], axis=1)
+    return float(np.ptp(form)), form_error("roundness", fit_feature("cylinder", points), points)
+
+
+def _cylindricity(side: int, rng: np.random.Generator) -> Case:
+    """The cylindricity of a cylinder."""
+    points, uv, form = make_cylinder(side, rng)
+    c, s, h = np.cos(np.pi * uv[:, 0]), np.sin(np.pi * uv[:, 0]), uv[:, 1]
+    truth = np.ptp(remove_fit(form, np.column_stack([np.ones(len(c)), c, s, h * c, h * s])))
+    return float(truth), form_error("cylindricity", fit_feature("cylinder", points), points)
+
+
+def _orientation(side: int, rng: np.random.Generator, upright: bool) -> Case:
+    """The parallelism of a tilted plate, or the perpendicularity of a leaning wall, to a plate without form."""
+    points, heights = make_plate(side, rng, TILT)
+    datum = np.column_stack([20 * make_grid(side), -20 + NOISE_MM * rng.normal(size=len(points))])
+    if upright:
+        points = points[:, [2, 1, 0]]
+    kind = "perpendicularity" if upright else "parallelism"
+    measured = orientation_error(kind, fit_feature("plane", points), points, fit_feature("plane", datum))  # type: ignore[arg-type]
+    return float(np.ptp(heights)), measured
+
+
+def _position(side: int, rng: np.random.Generator) -> Case:
+    """The position of a cap of a sphere about a drawn centre, against the origin."""
+    c, t = rng.uniform(np.cos(1.0), 1, side**2), rng.uniform(0, 2 * np.pi, side**2)
     q = np.sqrt(1 - c * c)
     out = np.stack([q * np.cos(t), q * np.sin(t), c], axis=1)
-    return ((10 + NOISE_MM * rng.normal(size=(n, 1))) * out + CENTRE,)
+    centre = 0.03 * rng.normal(size=3)
+    points = (RADIUS + NOISE_MM * rng.normal(size=(len(c), 1))) * out + centre
+    nominal = Feature("sphere", np.zeros(3), None, RADIUS)
+    return 2 * float(np.linalg.norm(centre)), position_error(fit_feature("sphere", points), points, nominal)
 
 
-def _flatness(clouds: Clouds) -> Quantity:
-    """The flatness of the first cloud."""
-    return form_error("flatness", fit_feature("plane", clouds[0]), clouds[0])
-
-
-def _roundness(clouds: Clouds) -> Quantity:
-    """The roundness of the middle section of the first cloud, a cylinder."""
-    return form_error("roundness", fit_feature("cylinder", clouds[0]), clouds[0])
-
-
-def _cylindricity(clouds: Clouds) -> Quantity:
-    """The cylindricity of the first cloud."""
-    return form_error("cylindricity", fit_feature("cylinder", clouds[0]), clouds[0])
-
-
-def _parallelism(clouds: Clouds) -> Quantity:
-    """The parallelism of the first cloud to the second."""
-    return orientation_error("parallelism", fit_feature("plane", clouds[0]), clouds[0], fit_feature("plane", clouds[1]))
-
-
-def _perpendicularity(clouds: Clouds) -> Quantity:
-    """The perpendicularity of the first cloud to the second."""
-    return orientation_error(
-        "perpendicularity", fit_feature("plane", clouds[0]), clouds[0], fit_feature("plane", clouds[1])
-    )
-
-
-def _position(clouds: Clouds) -> Quantity:
-    """The position of the first cloud, a sphere, about the origin."""
-    return position_error(fit_feature("sphere", clouds[0]), clouds[0], Feature("sphere", np.zeros(3), None, 10.0))
-
-
-def _profile(clouds: Clouds) -> Quantity:
-    """The profile of the first cloud against the plane z = 0."""
+def _profile(side: int, rng: np.random.Generator) -> Case:
+    """The profile of a plate against the plane z = 0."""
+    points, heights = make_plate(side, rng)
     nominal = Feature("plane", np.zeros(3), np.array([0.0, 0.0, 1.0]))
-    return profile_error(clouds[0], nominal.distance(clouds[0]), nominal.normals(clouds[0]))
+    return 2 * float(np.abs(heights).max()), profile_error(points, nominal.distance(points), nominal.normals(points))
 
 
-CASES: dict[str, tuple[float, Callable[[int, np.random.Generator], Clouds], Callable[[Clouds], Quantity]]] = {
-    "flatness": (0.1, make_bowed_plate, _flatness),
-    "roundness": (0.1, make_lobed_cylinder, _roundness),
-    "cylindricity": (0.15, make_lobed_cylinder, _cylindricity),
-    "parallelism": (0.08, make_tilted_plate, _parallelism),
-    "perpendicularity": (0.08, make_leaning_wall, _perpendicularity),
-    "position": (2 * float(np.linalg.norm(CENTRE)), make_sphere, _position),
-    "profile": (0.2, make_bowed_plate, _profile),
+CASES: dict[str, Callable[[int, np.random.Generator], Case]] = {
+    "flatness": _flatness,
+    "roundness": _roundness,
+    "cylindricity": _cylindricity,
+    "parallelism": lambda side, rng: _orientation(side, rng, False),
+    "perpendicularity": lambda side, rng: _orientation(side, rng, True),
+    "position": _position,
+    "profile": _profile,
 }
-"""Of each characteristic its true value, mm, a part that has it, and how it is measured."""
+"""Of each characteristic: measure a part that is drawn; returns its true value, mm, and what was measured."""

@@ -4,17 +4,20 @@ import os
 import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Concatenate, ParamSpec
 
 from slviewer.errors import InputError
+from slviewer.evaluation.render import format_count
 from slviewer.inspection.tolerance import DECIDED
 from slviewer.pipeline import measurements
 from slviewer.pipeline.compare import NominalComparison, compare_surface
+from slviewer.pipeline.inspect_parts import Inspection, inspect_surfaces, save_inspection, write_inspection
 from slviewer.pipeline.measured_surface import MeasuredSurface
 from slviewer.pipeline.plan import TOLERANCE_MM, make_plan
 from slviewer.session import atomic
-from slviewer.session.inspection_plan import write_plan
+from slviewer.session.inspection_plan import OWN_PLAN, PLANS, list_plans, read_plan, write_plan
 from slviewer.session.measurements import Measurement
 from slviewer.session.names import safe_name
 from slviewer.session.nominal import NOMINALS, Units, read_nominal
@@ -25,7 +28,9 @@ from slviewer.wizard.requests import RequestHandler, request
 from slviewer.wizard.surfaces import Surfaces
 
 P = ParamSpec("P")
-TABLE, PLAN = "measurements.csv", "plan.toml"
+TABLE, PLAN = "measurements.csv", Path(OWN_PLAN).name
+PARTS = ("parts.html", "parts.csv")
+"""The report and the table of a run of a plan."""
 MEASURING, COMPARING = "Measuring", "Comparing with the nominal model"
 
 
@@ -71,22 +76,82 @@ class MeasureRequests(RequestHandler):
     @request("Reading the nominal model")
     def upload_nominal(self, name: str, content: bytes) -> None:
         """Save an uploaded nominal model in the session, if it can be read."""
+        self._save_upload("Reading the nominal model", NOMINALS, name, content, lambda path: read_nominal(path).text())
+
+    @request("Reading the plan")
+    def upload_plan(self, name: str, content: bytes) -> None:
+        """Save an uploaded inspection plan in the session, if it can be read. Its nominal model is the session's one of
+        that file name."""
+
+        def describe(path: Path) -> str:
+            """Read the plan; returns a sentence about it."""
+            plan = read_plan(path)
+            return f"{plan.name}: {format_count(len(plan.characteristic), 'characteristic')}; run it on a scan"
+
+        if not name.lower().endswith(".toml"):
+            raise InputError(f"{name} is no plan: choose the .toml file that Make plan or slviewer plan wrote")
+        self._save_upload("Reading the plan", PLANS, name, content, describe)
+
+    def _save_upload(self, title: str, place: str, name: str, content: bytes, read: Callable[[Path], str]) -> None:
+        """Save an uploaded file in a folder of the session, if ``read`` can read it, which describes it."""
         store, plain = self._engine.store, plain_name(name)
 
         def work(report: Reporter) -> str:
-            """Write the upload to the session's nominal models if it can be read; returns its description."""
+            """Write the upload to its place if it can be read; returns its description."""
             report(0.0, f"reading {plain}")
-            target = store.folder / NOMINALS / plain
+            target = store.folder / place / plain
             with atomic.staged_folder(target, len(content)) as folder:
                 (folder / plain).write_bytes(content)
-                description = read_nominal(folder / plain).text()
+                description = read(folder / plain)
                 report.saving()
                 os.replace(folder / plain, target)
             atomic.discard(folder)
             report(1.0, "read")
             return description
 
-        self._submit("Reading the nominal model", work, str)
+        self._submit(title, work, str)
+
+    @request("Running the plan")
+    def run_plan(self, plan: str, *surfaces: str) -> None:
+        """Inspect surfaces, each a part, by a plan of `SessionView.plans`; also writes the report into the exports."""
+        store = self._engine.store
+        if plan not in list_plans(store.folder):
+            raise InputError(f"there is no plan {plan!r} in the session: make or upload one first")
+        if not surfaces:
+            raise InputError("no scan to inspect: reconstruct one in the step Scan first")
+
+        def work(report: Reporter) -> Inspection:
+            """Inspect all parts, write the report, and save the results."""
+            read = read_plan(store.folder / plan)
+            if read.alignment.nominal is not None:
+                own = store.folder / NOMINALS / Path(read.alignment.nominal).name
+                read = replace(read, alignment=replace(read.alignment, nominal=str(own))) if own.is_file() else read
+            inputs = dict[str, str]()
+
+            def load(name: str) -> MeasuredSurface:
+                """Load the surface of a part."""
+                surface = self._surfaces.load(store, name)
+                inputs.update(surface.inputs)
+                return surface
+
+            sources = [(name, lambda _, name=name: load(name)) for name in surfaces]
+            inspection = inspect_surfaces(read, sources, report.within(0, 0.95))  # type: ignore[arg-type]
+            with atomic.staged_folder(store.exports / PARTS[0], 0) as folder:
+                written = write_inspection(inspection, folder)
+                report.saving()
+                for path in written.files:
+                    os.replace(path, store.exports / path.name)
+            atomic.discard(folder)
+            save_inspection(store.guarded(report.saving), inspection, inputs)
+            report(1.0, "inspected")
+            return inspection
+
+        def done(inspection: Inspection) -> None:
+            """Report how many parts pass, and mark the session as changed."""
+            self._engine.notices.add("warning" if inspection.failure else "good", describe_inspection(inspection))
+            self._engine.publisher.mark_changed(session=True)
+
+        self._engine.jobs.submit("Running the plan", work, done)
 
     @request(COMPARING)
     def compare_nominal(
@@ -161,8 +226,8 @@ class MeasureRequests(RequestHandler):
                 write_plan(made, path)
             report(1.0, "written")
             return (
-                f"{PLAN} is ready to download: {len(made.characteristic)} characteristics; set its limits, then run "
-                f"slviewer inspect-parts {PLAN} SESSION..."
+                f"{PLAN} is ready to download: {format_count(len(made.characteristic), 'characteristic')}; set its "
+                f"limits, then upload it below, or run slviewer inspect-parts {PLAN} SESSION..."
             )
 
         self._submit("Making the plan", work, str)
@@ -181,6 +246,12 @@ def describe_measurement(measured: Measurement) -> str:
     """Describe a measurement in one sentence: its name and quantities."""
     values = "; ".join(quantity.text() for quantity in measurements.quantities_of(measured))
     return f"{measured.name}: {values}"
+
+
+def describe_inspection(inspection: Inspection) -> str:
+    """Describe in a sentence how many parts pass."""
+    failure = inspection.failure
+    return f"{inspection.plan.name}: {failure or f'all {len(inspection.parts)} parts pass'}"
 
 
 def describe_comparison(result: NominalComparison) -> str:

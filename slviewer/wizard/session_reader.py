@@ -15,6 +15,7 @@ from slviewer.calibration.observe import Observation
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import DamagedError, InputError, SessionError
 from slviewer.fringe.presets import PRESETS
+from slviewer.inspection.parts import PartResult
 from slviewer.pipeline import align
 from slviewer.pipeline.calibration_verdict import load_last_verdict
 from slviewer.pipeline.capture import DEFAULT_PATTERNS
@@ -32,6 +33,7 @@ from slviewer.pipeline.verifications import centre_spacings, read_verification
 from slviewer.records import from_plain
 from slviewer.report.data import VerificationView
 from slviewer.session.capture import Capture
+from slviewer.session.inspection_plan import Characteristic, list_plans
 from slviewer.session.measurements import FOLDER as MEASUREMENTS
 from slviewer.session.measurements import NAMES, Measurement, measurement_from_meta
 from slviewer.session.names import natural_key
@@ -46,6 +48,7 @@ from slviewer.wizard.pose_plan import PlanInput, PoseFeatures, PosePlan
 from slviewer.wizard.result_views import merge_view
 from slviewer.wizard.snapshot import (
     CalibrationView,
+    InspectionView,
     MergeView,
     PoseState,
     PoseView,
@@ -196,6 +199,8 @@ class SessionReader:
             measurements=self._attempt("the measurements", lambda: self._read_measurements(inputs), ()),
             deleted_measurements=sum(name.startswith(f"{MEASUREMENTS}/") for name in session.deleted_results()),
             nominals=list_nominals(session.folder),
+            plans=list_plans(session.folder),
+            inspection=self._attempt("the inspection", lambda: self._read_inspection(inputs), None),
             exports=list_exports(session),
             exposures_ms=self.exposures_ms(),
             is_linear=self.levels() is not None,
@@ -445,6 +450,15 @@ class SessionReader:
                 if not stale:
                     known[result] = meta["hash"]
         return tuple(read)
+
+    def _read_inspection(self, inputs: _Inputs) -> InspectionView | None:
+        """Read the latest run of an inspection plan; None where there is none."""
+        if not (names := self._list_results("inspection/")):
+            return None
+        meta = self._load_meta(names[-1])
+        characteristic = from_plain(meta["characteristic"], tuple[Characteristic, ...])
+        parts = from_plain(meta["parts"], tuple[PartResult, ...])
+        return InspectionView(meta["plan"], characteristic, parts, _has_changed(meta["inputs"], inputs.hashes))
 
     # files
 

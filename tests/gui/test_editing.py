@@ -3,6 +3,7 @@
 import re
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,9 +17,12 @@ from slviewer.devices.simulated import simulated_rig
 from slviewer.devices.world import SimulatedWorld
 from slviewer.gui.app import App
 from slviewer.gui.scene import read_view
+from slviewer.inspection.regions import Region
 from slviewer.pipeline.capture import capture
+from slviewer.pipeline.measurements import add_fit
 from slviewer.pipeline.rig_choice import RigSetup
 from slviewer.server.secure import Serving
+from slviewer.session.inspection_plan import OWN_PLAN, read_plan, write_plan
 from slviewer.session.scan_edits import load_edits
 from slviewer.simulation.rig import letter
 from slviewer.simulation.turning import turn_pose, turning
@@ -266,3 +270,56 @@ def test_six_clicks_make_a_clean_textured_mesh_of_a_part_on_a_table(tmp_path: Pa
     assert 0.02 < np.median(height) < 0.2 and np.percentile(height, 99) < 0.6  # the calibration is without distortion
     assert away.max() < 3.0  # nothing is left of the table
     assert np.asarray(mesh.visual.material.baseColorTexture).shape[:2] == (2048, 2048)
+
+
+def test_a_plan_is_made_uploaded_and_run_on_two_scans(tmp_path: Path, browser: Browser) -> None:
+    folder, rig = tmp_path / "session", letter(0.25)
+    true_calibration(folder, rig)
+    world = SimulatedWorld(rig)
+    world.place("sphere")
+    capture_scans(folder, world, {"a": 0.0, "b": 0.0}, "p18")
+    with Operator(folder) as operator:
+        for name in ("a", "b"):
+            operator.reconstruct(name)
+            operator.wait_until_idle()
+        top = world.pose.t - [0.0, 0.0, 98.0]
+        assert operator.measure("a", add_fit, "sphere", Region.ball(top, 60.0))
+        operator.wait_until_idle()
+        app = App(operator, Serving(port=0))
+        page = browser.new_page(viewport=SIZE)
+        page.set_default_timeout(20_000)
+        opened = Opened(page)
+        page.goto(app.server.link())
+        button(page, "8. Measure").click()
+        button(page, "Make plan").click()
+        wait_until(page, lambda: operator.snapshot().session.plans == (OWN_PLAN,))  # type: ignore[union-attr]
+        unfold(page, "Inspection plan")
+        choose(page, "Parts", "all 2 scans")
+        button(page, "Run plan").click()
+
+        def decisions() -> list[str]:
+            seen = operator.snapshot().session.inspection  # type: ignore[union-attr]
+            return [] if seen is None else [part.decision for part in seen.parts]
+
+        wait_until(page, lambda: len(decisions()) == 2)
+        assert decisions() == ["undecided", "undecided"]  # the plan's own tolerance is as small as the uncertainty
+        expect(page.get_by_text("2 undecided", exact=True)).to_be_visible()
+
+        plan = read_plan(folder / OWN_PLAN)
+        (diameter,) = (each for each in plan.characteristic if each.kind == "diameter")
+        wide = (replace(diameter, lower=195.0, upper=199.0), replace(diameter, name="small", lower=190.0, upper=191.0))
+        write_plan(replace(plan, name="ball", characteristic=wide[:1]), tmp_path / "ball.toml")
+        write_plan(replace(plan, name="small", characteristic=wide), tmp_path / "small.toml")
+        for count, (name, judged) in enumerate((("ball", "2 pass"), ("small", "2 fail")), 2):
+            with page.expect_file_chooser() as chooser:
+                button(page, "Upload plan").click()
+            chooser.value.set_files(tmp_path / f"{name}.toml")
+            wait_until(page, lambda count=count: len(operator.snapshot().session.plans) == count)  # type: ignore[misc,union-attr]
+            choose(page, "Plan", f"{name}.toml")
+            button(page, "Run plan").click()
+            expect(page.get_by_text(judged, exact=True)).to_be_visible(timeout=PATIENCE_S * 1000)
+        assert "small" in (folder / "exports" / "parts.html").read_text()
+        assert cut_labels(page) == []
+        assert opened.errors == []
+        page.close()
+        app.close()

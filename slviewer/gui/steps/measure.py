@@ -6,6 +6,7 @@ import numpy as np
 import viser
 
 from slviewer.gui.inputs import Choice, change
+from slviewer.gui.inspection_inputs import InspectionInputs
 from slviewer.gui.measure_list import MeasurementList
 from slviewer.gui.measure_surface import SurfaceView
 from slviewer.gui.measure_tools import COMPARE, FIT, PICK, Tool
@@ -41,6 +42,7 @@ class Panel(StepPanel):
         self._related: list[tuple[str, str]] = []
         self._surface = SurfaceView(context, self._painter, LAYER, self._handle_loaded)
         self._results = MeasurementList(context, self._painter, LAYER, self._show_measurement)
+        self._inspection = InspectionInputs(context)
 
     def build(self) -> None:
         """Create the inputs of surface, tools and results."""
@@ -59,6 +61,7 @@ class Panel(StepPanel):
         self._escape = gui.add_command("End the measuring tool", hotkey="escape", disabled=True)
         self._escape.on_trigger(context.callback(lambda: self._select_tool("")))
         self._results.build()
+        self._inspection.build()
         self._draw_tool()
 
     def _build_fit(self) -> None:
@@ -106,6 +109,7 @@ class Panel(StepPanel):
             change(self._tools_folder, visible=has_surface)
             self._offer_inputs(session)
             new = self._results.draw(session, self._surface.name)
+            self._inspection.draw(snapshot, self._surface.name)
             if self._tool.fits and any(each.kind == self._tool.name.lower() for each in new):
                 self._select_tool(self._tool.name)
             change(self._compare, disabled=snapshot.is_busy or not self._nominal.value)
