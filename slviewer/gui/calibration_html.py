@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 
 from slviewer.calibration.diagnosis.verdict import Finding, Verdict
+from slviewer.gui.help_links import help_link
 from slviewer.gui.widgets import Html, Tone, alert, coloured, paragraph, report_table, to_html
 from slviewer.report.quality import splined_table
 from slviewer.wizard.snapshot import CalibrationView, SplinedView
@@ -101,11 +102,11 @@ def splined_html(splined: SplinedView) -> Html:
 
 def _format_finding(finding: Finding) -> str:
     """Return the HTML of a finding and its remedy."""
-    text = to_html(_capitalise(finding.sentence, finding.poses))
+    text, link = to_html(_capitalise(finding.sentence, finding.poses)), help_link(finding.cause)
     if finding.severity == "note":
-        return f'<div style="margin-top:0.5em">{coloured("Corrected:", "dim")} {text}.</div>'
+        return f'<div style="margin-top:0.5em">{coloured("Corrected:", "dim")} {text}. {link}</div>'
     remedy = coloured(f"{finding.remedy[:1].upper()}{finding.remedy[1:]}.", "plain", bold=True)
-    return f'<div style="margin-top:0.5em">{text}.<br>→ {remedy}</div>'
+    return f'<div style="margin-top:0.5em">{text}.<br>→ {remedy} {link}</div>'
 
 
 def _capitalise(text: str, names: Sequence[str] = ()) -> str:

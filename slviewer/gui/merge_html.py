@@ -4,7 +4,9 @@ import re
 from collections.abc import Mapping, Sequence
 
 from slviewer.evaluation import letter
+from slviewer.gui.help_links import help_link
 from slviewer.gui.widgets import Html, Tone, alert, coloured, meter, paragraph, table, to_html
+from slviewer.registration.refusal import Reason
 from slviewer.wizard.snapshot import MergedLoop, MergedPair, MergeView
 from slviewer.wizard.steps import MIN_OVERLAP
 
@@ -36,6 +38,7 @@ def merge_html(merge: MergeView, labels: Mapping[str, str]) -> Html:
     if merge.refused:
         pairs = "".join(f"<li>{to_html(use_labels(why, labels))}</li>" for why in merge.refused)
         title = "Pairs that could not be registered"
+        pairs += f"<li>{help_link('merge')}</li>"
         parts.append(
             paragraph(Html(f'<details><summary>{title}</summary><ul style="padding-left:1.4em">{pairs}</ul></details>'))
         )
@@ -49,10 +52,13 @@ def merge_html(merge: MergeView, labels: Mapping[str, str]) -> Html:
     return Html("".join(parts))
 
 
-def merge_failure_html(why: str, labels: Mapping[str, str], merge: MergeView | None = None) -> Html:
-    """Describe why the last merge failed; ``merge``: the previous one, which is still shown."""
+def merge_failure_html(
+    why: str, labels: Mapping[str, str], merge: MergeView | None = None, refusal: Reason | None = None
+) -> Html:
+    """Describe why the last merge failed, with its ``refusal``; ``merge``: the previous one, which is still shown."""
     still = "" if merge is None else " The previous merge is shown below."
-    return alert(Html(f"<b>Not merged.</b> {to_html(use_labels(why, labels) + still)}"), "error")
+    link = help_link(f"merge-{refusal}" if refusal else "merge")
+    return alert(Html(f"<b>Not merged.</b> {to_html(use_labels(why, labels) + still)} {link}"), "error")
 
 
 def turntable_html(names: Sequence[str], table_deg: Sequence[float], labels: Mapping[str, str]) -> Html:

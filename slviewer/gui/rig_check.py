@@ -2,6 +2,7 @@
 
 import viser
 
+from slviewer.gui.help_links import help_link
 from slviewer.gui.inputs import SessionValue, change
 from slviewer.gui.panel import PanelContext
 from slviewer.gui.widgets import Html, Text, Tone, coloured, paragraph, to_html
@@ -62,8 +63,9 @@ def checks_table(result: Preflight) -> Html:
     for check in result.checks:
         mark = coloured(_MARKS[check.verdict], _TONES[check.verdict], bold=True)
         remedy = f"<div>{coloured(check.remedy, _TONES[check.verdict])}</div>" if check.remedy else ""
+        link = "" if check.verdict == "good" else f" {help_link(f'check-{check.name}')}"
         lines.append(
             f'<div style="{_ROW}"><div style="width:1em;text-align:center">{mark}</div>'
-            f'<div style="flex:1"><b>{to_html(check.name)}</b>&ensp;{to_html(check.sentence)}{remedy}</div></div>'
+            f'<div style="flex:1"><b>{to_html(check.name)}</b>&ensp;{to_html(check.sentence)}{link}{remedy}</div></div>'
         )
     return paragraph(Html("".join(lines)))

@@ -14,6 +14,7 @@ import viser
 from slviewer.calibration.next_pose import nominal_lens
 from slviewer.errors import hide_passwords
 from slviewer.evaluation.render import format_count
+from slviewer.gui.help_links import STAGES, help_link, step_help_link
 from slviewer.gui.inputs import change
 from slviewer.gui.panel import PanelContext, StepPanel
 from slviewer.gui.scene import CAMERA, PROJECTOR, ViewerScene
@@ -195,10 +196,10 @@ class Shell:
         step = steps[at]
         state = {"done": coloured("done", "good"), "ready": "", "blocked": coloured("blocked", "warning")}[step.state]
         title = f'<div style="font-size:1.25rem;font-weight:600">{at + 1}&ensp;{to_html(step.title)}&ensp;'
-        title += f'<span style="font-size:0.8rem">{state}</span></div>'
+        title += f'<span style="font-size:0.8rem">{state}</span>{step_help_link(step.key)}</div>'
         self._heading.set(paragraph(Html(f"{title}<div style='margin-top:0.2em'>{to_html(step.instruction)}</div>")))
         blocked = alert(step.blocked_by, "warning") if step.blocked_by else ""
-        self._problems.set(blocked + "".join(alert(sentence, "error") for sentence in step.problems))
+        self._problems.set(blocked + "".join(_problem_html(step.key, sentence) for sentence in step.problems))
         following = steps[at + 1] if at + 1 < len(steps) else None
         ready = step.state == "done" and following is not None and following.state != "blocked"
         if ready and following is not None:
@@ -292,6 +293,11 @@ def notify(client: viser.ClientHandle, level: Level, text: str) -> None:
     """Show a notification in one browser."""
     title, colour, seconds, _ = _NOTICES[level]
     client.add_notification(title, hide_passwords(text), color=colour, auto_close_seconds=seconds)
+
+
+def _problem_html(step: str, sentence: str) -> Html:
+    """Return a problem of a step, with a link to what the help says on those of its stage."""
+    return alert(Html(f"{to_html(sentence)} {help_link(STAGES[step])}"), "error")
 
 
 def greet_viewer(client: viser.ClientHandle) -> None:

@@ -1,10 +1,16 @@
 """Results of the checks of a rig or of a capture."""
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 CheckVerdict = Literal["good", "warning", "bad", "unknown"]
 """Fit to capture; with reservations; not before it is corrected; could not be determined."""
+
+CheckName = Literal[
+    "screen", "latency", "order", "repeats", "exposure", "gamma", "pixels", "flicker", "ambient", "motion",
+    "turntable", "description", "noise", "decoding",
+]  # fmt: skip
+CHECK_NAMES: tuple[CheckName, ...] = get_args(CheckName)
 
 _WORST_FIRST: tuple[CheckVerdict, ...] = ("bad", "warning", "good")
 
@@ -15,7 +21,7 @@ class Check:
     ``figures`` that it is based on, whose names contain their units.
     """
 
-    name: str
+    name: CheckName
     verdict: CheckVerdict
     sentence: str
     remedy: str
@@ -43,7 +49,7 @@ class Preflight:
         verdicts = {check.verdict for check in self.checks}
         return next((verdict for verdict in _WORST_FIRST if verdict in verdicts), "unknown")
 
-    def check(self, name: str) -> Check:
+    def check(self, name: CheckName) -> Check:
         """The check called `name`. Raises KeyError."""
         return {check.name: check for check in self.checks}[name]
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from slviewer.devices.protocols import Rig
 from slviewer.pipeline.capture import set_camera
-from slviewer.pipeline.check_results import Check, Preflight
+from slviewer.pipeline.check_results import Check, CheckName, Preflight
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
 from slviewer.pipeline.open_session import SessionLike, opened
 from slviewer.pipeline.rig_choice import SetUp, set_up
@@ -68,7 +68,17 @@ _EXPECTED_IMAGES = 52
 """How often about the bench shows something: what progress is measured by."""
 _AVERAGED_IMAGES = 8  # images
 _LONG_MS = 300.0  # of patience where the delay is unknown
-_CHECK_ORDER = ("latency", "exposure", "flicker", "gamma", "pixels", "order", "repeats", "ambient", "motion")
+_CHECK_ORDER: tuple[CheckName, ...] = (
+    "latency",
+    "exposure",
+    "flicker",
+    "gamma",
+    "pixels",
+    "order",
+    "repeats",
+    "ambient",
+    "motion",
+)
 
 
 def preflight(rig: Rig, *, say: Callable[[str], None] | None = None, progress: Progress | None = None) -> Preflight:

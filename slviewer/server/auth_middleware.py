@@ -14,8 +14,10 @@ from websockets.http11 import Request, Response
 from slviewer.server.access import Access, Grant, Refusal, Role
 from slviewer.server.connection import Connection
 from slviewer.server.downloads import PREFIX, Downloads
+from slviewer.server.help_pages import PREFIX as HELP_PREFIX
+from slviewer.server.help_pages import HelpPages
 from slviewer.server.limits import Admissions, address_group
-from slviewer.server.responses import harden, page_policy, respond, viser_policy
+from slviewer.server.responses import HELP_POLICY, harden, page_policy, respond, viser_policy
 
 logger = logging.getLogger("slviewer.server")
 
@@ -61,6 +63,7 @@ class AuthMiddleware:
         self._subprotocol = subprotocol
         self._strict_transport = strict_transport
         self._login_page = resources.files("slviewer.server").joinpath("login.html").read_bytes()
+        self._help = HelpPages()
 
     async def answer(self, connection: Connection, request: Request) -> Response | None:
         """Return the response to a request, hardened; None to open a WebSocket."""
@@ -110,9 +113,20 @@ class AuthMiddleware:
             return self._page(self._viser_page, viser_policy(self._scripts, host))
         if rest.startswith(PREFIX):
             return await self._download(connection, rest)
+        if rest.startswith(HELP_PREFIX):
+            return self._show_help(rest.removeprefix(HELP_PREFIX))
         if grant.role == "operate" and DEVICE_PATHS.get(rest) in self._device_pages:
             return self._lead_to(access.grants[DEVICE_PATHS[rest]], request)
         raise Refusal(HTTPStatus.NOT_FOUND, "There is nothing here for this link.")
+
+    def _show_help(self, name: str) -> Response:
+        """Respond with a page or a picture of the documentation; raises Refusal where there is none of this name."""
+        file = self._help.file(name)
+        if file is None:
+            raise Refusal(HTTPStatus.NOT_FOUND, "There is no such page in the help.")
+        response = respond(HTTPStatus.OK, file.content, file.content_type)
+        harden(response.headers, HELP_POLICY)
+        return response
 
     def _check_websocket(self, request: Request, grant: Grant, rest: str) -> None:
         """Raise Refusal unless the role has a WebSocket at the rest of this path."""

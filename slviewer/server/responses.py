@@ -9,6 +9,8 @@ from websockets.datastructures import Headers
 from websockets.http11 import Response
 
 _CLOSED = "default-src 'none'; frame-ancestors 'none'; base-uri 'none'; form-action 'none'"
+HELP_POLICY = f"{_CLOSED}; style-src 'unsafe-inline'; img-src 'self'"
+"""Content-Security-Policy of the documentation: nothing runs there, and only this server's pictures are shown."""
 
 
 def respond(status: HTTPStatus, body: bytes | str = b"", content_type: str = "text/plain; charset=utf-8") -> Response:

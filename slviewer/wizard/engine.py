@@ -24,6 +24,7 @@ from slviewer.pipeline.frame_check import load_check, load_or_save_check
 from slviewer.pipeline.poses import read_stored_poses
 from slviewer.pipeline.rig_choice import Choice, RigSetup, SetUp, list_needed_pages
 from slviewer.pipeline.rig_presets import save_rig
+from slviewer.registration.refusal import Reason
 from slviewer.session.capture import Capture
 from slviewer.session.reading import expand_user
 from slviewer.session.store import Session
@@ -72,6 +73,7 @@ class Engine:
         self._autopilot = ""
         self._preparing: float | None = None
         self._merge_failure = ""
+        self._merge_refusal: Reason | None = None
         self._choice: Choice | None = None
         self._rig_fault = ""  # why the chosen rig could not even be set up
         self._reader: SessionReader | None = None
@@ -256,9 +258,9 @@ class Engine:
         self._preparing = share
         self.publisher.mark_changed()
 
-    def set_merge_failure(self, why: str) -> None:
-        """Set the reason why the last merge failed; empty: it did not."""
-        self._merge_failure = why
+    def set_merge_failure(self, why: str, reason: Reason | None = None) -> None:
+        """Set why the last merge failed, empty: it did not; ``reason``: that of a refused registration."""
+        self._merge_failure, self._merge_refusal = why, reason
         self.publisher.mark_changed()
 
     def close(self) -> None:
@@ -405,6 +407,7 @@ class Engine:
             exposure_change=self.exposure_change,
             live=self.live.figures() if self.live is not None and self.live.is_running else None,
             merge_failure=self._merge_failure,
+            merge_refusal=self._merge_refusal,
             read_failure=read_failure,
             preparing=self._preparing,
         )

@@ -60,7 +60,7 @@ class MergeRequests(RequestHandler):
             text = describe_error(MERGING, error)
             if isinstance(error, Refused) and error.reason in ("overlap", "disagree"):
                 text = f"{text} {_ALTERNATIVES[start]}"
-            engine.set_merge_failure(text)
+            engine.set_merge_failure(text, error.reason if isinstance(error, Refused) else None)
             engine.notices.add("error", text)
 
         self._submit(MERGING, merge, describe, failed)

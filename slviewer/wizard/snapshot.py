@@ -18,6 +18,7 @@ from slviewer.inspection.parts import PartResult
 from slviewer.pipeline.align import Placement
 from slviewer.pipeline.check_results import Preflight
 from slviewer.pipeline.suggest_exposure import ExposureSuggestion
+from slviewer.registration.refusal import Reason
 from slviewer.report.data import SpacingRow, VerificationView
 from slviewer.session.capture import TurnStep
 from slviewer.session.inspection_plan import Characteristic
@@ -384,6 +385,7 @@ class Snapshot:
     exposure_change: ExposureChange | None = None  # the last suggestion for the rig in use, unless it was undone
     live: LiveView | None = None  # None while no live scan runs
     merge_failure: str = ""  # why the last merge was refused, or failed
+    merge_refusal: Reason | None = None  # that of its registration
     read_failure: str = ""  # why this is not the current state: files that could not be read just now
     preparing: float | None = None  # share of the kernels compiled in the background; None while none are
 

@@ -85,7 +85,7 @@ class Panel(StepPanel):
             labels = {scan.name: scan.label for scan in scans}
             self._result.set(merge_html(merge, labels) if merge else "")
             failure = snapshot.merge_failure
-            self._failure.set(merge_failure_html(failure, labels, merge) if failure else "")
+            self._failure.set(merge_failure_html(failure, labels, merge, snapshot.merge_refusal) if failure else "")
             self._offer_views(merge)
             self._propose_start(scans)
             number = int(merge.name) if merge is not None else 0

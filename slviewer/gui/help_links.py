@@ -1,0 +1,55 @@
+"""Links from panels to the help: a section for each step, and one for each finding.
+
+A finding's section is named after its key: the cause of a diagnosis, the name of a check, the reason of a refusal.
+"""
+
+from typing import get_args
+
+from slviewer.calibration.diagnosis.verdict import CAUSES
+from slviewer.fringe.phase import Reason as PixelReason
+from slviewer.fringe.suspect import Fault
+from slviewer.gui.widgets import Html, to_html
+from slviewer.pipeline.check_results import CHECK_NAMES
+from slviewer.registration.refusal import Reason as Refusal
+from slviewer.server.help_pages import PREFIX
+
+STEPS_PAGE, FINDINGS_PAGE = "howto/wizard.md", "explanation/findings.md"
+FINDINGS: tuple[str, ...] = tuple(
+    dict.fromkeys(
+        [
+            *(f"frame-{fault}" for fault in get_args(Fault)),
+            *(f"pixel-{reason.name.lower()}" for reason in PixelReason if reason != PixelReason.VALID),
+            *(f"check-{name}" for name in CHECK_NAMES),
+            *CAUSES,
+            *(f"merge-{reason}" for reason in get_args(Refusal)),
+        ]
+    )
+)
+"""Anchors of the findings, one section each."""
+STAGES = {
+    "rig": "check-of-the-rig",
+    "target": "target-poses",
+    "poses": "target-poses",
+    "calibrate": "calibration",
+    "verify": "scans-and-verification",
+    "scan": "scans-and-verification",
+    "merge": "merge",
+    "measure": "measurements",
+    "export": "measurements",
+}
+"""{step: anchor of the findings of its stage}."""
+
+
+def help_link(anchor: str, page: str = FINDINGS_PAGE, style: str = "") -> Html:
+    """Return a link that opens a section of a page of the help in another tab.
+
+    Its address is relative to the wizard's own, which differs between the operator and those who watch.
+    """
+    address = to_html(f"{PREFIX}{page}#{anchor}")
+    colour = "color:var(--mantine-color-anchor);font-weight:400;white-space:nowrap"
+    return Html(f'<a href="{address}" target="_blank" rel="noopener" style="{colour};{style}">Help</a>')
+
+
+def step_help_link(step: str) -> Html:
+    """Return the link to the section of a step, for the right end of its heading."""
+    return help_link(step, STEPS_PAGE, "float:right;font-size:0.875rem;line-height:1.9rem")

@@ -1,0 +1,185 @@
+"""The pages of the documentation, which the server shows to whoever may see the wizard, without a network.
+
+They are the Markdown files of `docs`, at addresses that end as their paths do, so that their links to each other hold.
+Only files listed at the start are served: an address is looked up in that list, and never becomes a path.
+"""
+
+import posixpath
+import re
+from collections import Counter
+from dataclasses import dataclass
+from functools import cache
+from importlib import resources
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+PREFIX = "help/"
+"""Below the path of the operator and of viewers; relative to their page, so that one link serves both."""
+_PACKAGE = Path(__file__).resolve().parent.parent
+_GROUPS = {
+    "": "Start",
+    "tutorials": "Tutorials",
+    "howto": "How to",
+    "hardware": "Hardware",
+    "explanation": "Explanation",
+}
+"""{folder: title}, in the order of the list; the folders whose pages are shown."""
+_DEVELOPMENT = ("index.md", "architecture.md")
+_PICTURES = {".png": "image/png", ".jpg": "image/jpeg", ".webp": "image/webp", ".svg": "image/svg+xml"}
+_HTML = "text/html; charset=utf-8"
+_SCHEME = re.compile(r"[a-z][a-z0-9+.-]*:|//", re.I)
+
+
+@dataclass(frozen=True)
+class HelpFile:
+    """A served file and the type of its content."""
+
+    content: bytes
+    content_type: str
+
+
+@dataclass(frozen=True)
+class _Heading:
+    """A heading of a page: its level, 1 the highest, its text, and the anchor that leads to it."""
+
+    level: int
+    text: str
+    anchor: str
+
+
+class HelpPages:
+    """The pages and pictures below one folder; without the folder there are none. May be used from any thread."""
+
+    def __init__(self, folder: Path | None = None) -> None:
+        """``folder``: that of the documentation, by default the one that ships with the program."""
+        folder = folder or docs_folder()
+        names = {} if folder is None else {p.relative_to(folder).as_posix(): p for p in sorted(folder.rglob("*.*"))}
+        served = {name: path for name, path in names.items() if _is_served(name) and path.is_file()}
+        self._pages = {name: path for name, path in served.items() if name.endswith(".md")}
+        self._pictures = {name: path for name, path in served.items() if path.suffix in _PICTURES}
+        self._rendered: dict[str, HelpFile] = {}
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the pages, as "howto/exposure.md", in the order of their list."""
+        folders = list(_GROUPS)
+        return tuple(sorted(self._pages, key=lambda name: (folders.index(_top_folder(name)), name)))
+
+    def file(self, name: str) -> HelpFile | None:
+        """Return what is at this place below PREFIX: the list of pages where it is empty; None where nothing is."""
+        if name in self._pictures:
+            path = self._pictures[name]
+            return HelpFile(path.read_bytes(), _PICTURES[path.suffix])
+        if name and name not in self._pages:
+            return None
+        if name not in self._rendered:
+            self._rendered[name] = HelpFile(self._render(name).encode(), _HTML)
+        return self._rendered[name]
+
+    def anchors(self, name: str) -> tuple[str, ...]:
+        """Return the anchors of a page, one for each heading. Raises KeyError."""
+        return tuple(heading.anchor for heading in _list_headings(_parse(self._pages[name].read_text("utf-8"))))
+
+    def _render(self, name: str) -> str:
+        """Return the HTML of a page, or of the list of pages."""
+        parser = _parser()
+        tokens = _parse(self._pages[name].read_text("utf-8")) if name else []
+        headings = _list_headings(tokens)
+        openings = (token for token in tokens if token.type == "heading_open")
+        for token, heading in zip(openings, headings, strict=True):
+            token.attrSet("id", heading.anchor)
+        self._correct_links(tokens, name)
+        root = "../" * name.count("/")
+        groups = [
+            (title, [(root + page, self._title(page), page == name) for page in self.names if _top_folder(page) == key])
+            for key, title in _GROUPS.items()
+        ]
+        return str(
+            _template().render(
+                title=self._title(name) if name else "Help",
+                body=parser.renderer.render(tokens, parser.options, {}),
+                headings=[heading for heading in headings if heading.level in (2, 3)],
+                groups=[(title, pages) for title, pages in groups if pages],
+                root=root or "./",
+            )
+        )
+
+    def _correct_links(self, tokens: list[Any], name: str) -> None:
+        """Open links to the web in another tab, and unlink what is not served (in place)."""
+        for token in (child for parent in tokens for child in parent.children or ()):
+            if token.type == "link_open":
+                address = str(token.attrGet("href") or "")
+                if _SCHEME.match(address):
+                    token.attrSet("target", "_blank")
+                    token.attrSet("rel", "noopener noreferrer")
+                elif not address.startswith("#"):
+                    target = posixpath.normpath(posixpath.join(posixpath.dirname(name), address.partition("#")[0]))
+                    if target not in self._pages and target not in self._pictures:
+                        del token.attrs["href"]
+            elif token.type == "image":
+                token.attrSet("loading", "lazy")
+
+    def _title(self, name: str) -> str:
+        """Return the first heading of a page, else its name."""
+        return _read_title(self._pages[name]) or name
+
+
+def docs_folder() -> Path | None:
+    """Return the folder of the documentation: in the package or, in a checkout, beside it; None if absent."""
+    return next((path for path in (_PACKAGE / "docs", _PACKAGE.parent / "docs") if path.is_dir()), None)
+
+
+def _top_folder(name: str) -> str:
+    """Return the first folder of a name; empty where there is none."""
+    return name.partition("/")[0] if "/" in name else ""
+
+
+def _is_served(name: str) -> bool:
+    """Whether a file of this name is one of the pages or pictures that a user of the program reads."""
+    folder = _top_folder(name)
+    if name.endswith(".md"):
+        return folder in _GROUPS and name not in _DEVELOPMENT and not name.endswith("/index.md")
+    return not any(part.startswith((".", "_")) for part in name.split("/"))
+
+
+@cache
+def _parser() -> Any:
+    """Return the Markdown parser: CommonMark with tables, and HTML shown as text."""
+    from markdown_it import MarkdownIt
+
+    return MarkdownIt("commonmark", {"html": False}).enable("table")
+
+
+@cache
+def _template() -> Any:
+    """Return the template of a page."""
+    from jinja2 import Environment
+
+    source = resources.files("slviewer.server").joinpath("help_page.html.j2").read_text("utf-8")
+    return Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True).from_string(source)
+
+
+@cache
+def _read_title(path: Path) -> str:
+    """Return the text of a page's first heading; empty without one."""
+    return next((heading.text for heading in _list_headings(_parse(path.read_text("utf-8")))), "")
+
+
+def _parse(text: str) -> list[Any]:
+    """Return the tokens of Markdown."""
+    tokens: list[Any] = _parser().parse(text)
+    return tokens
+
+
+def _list_headings(tokens: list[Any]) -> list[_Heading]:
+    """List the headings among a page's tokens, with the anchors that GitHub and Sphinx give them."""
+    headings, used = [], Counter[str]()
+    for opening, inline in pairwise(tokens):
+        if opening.type == "heading_open":
+            text = "".join(c.content for c in inline.children if c.type in ("text", "code_inline"))
+            anchor = re.sub(r"[^\w\- ]", "", text.lower()).replace(" ", "-")
+            used[anchor] += 1
+            unique = anchor if used[anchor] == 1 else f"{anchor}-{used[anchor] - 1}"
+            headings.append(_Heading(int(opening.tag[1]), text, unique))
+    return headings
