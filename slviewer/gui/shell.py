@@ -336,4 +336,5 @@ def _fault_alerts(snapshot: Snapshot) -> str:
 def _notice_html(notice: Notice) -> str:
     """Return the HTML of a notice: its time, and the text in its tone."""
     time = coloured(f"{notice.time:%H:%M}", "dim")
-    return paragraph(Html(f"{time} {coloured(notice.text, _NOTICES[notice.level][3])}"))
+    link = f" {help_link(notice.section)}" if notice.section else ""
+    return paragraph(Html(f"{time} {coloured(notice.text, _NOTICES[notice.level][3])}{link}"))

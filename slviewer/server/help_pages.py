@@ -113,12 +113,15 @@ class HelpPages:
                 if _SCHEME.match(address):
                     token.attrSet("target", "_blank")
                     token.attrSet("rel", "noopener noreferrer")
-                elif not address.startswith("#"):
-                    target = posixpath.normpath(posixpath.join(posixpath.dirname(name), address.partition("#")[0]))
-                    if target not in self._pages and target not in self._pictures:
-                        del token.attrs["href"]
-            elif token.type == "image":
-                token.attrSet("loading", "lazy")
+                elif not address.startswith("#") and not self._is_known(address.partition("#")[0], name):
+                    del token.attrs["href"]
+            elif token.type == "image" and not self._is_known(str(token.attrs["src"]), name):
+                del token.attrs["src"]  # its description is shown
+
+    def _is_known(self, address: str, name: str) -> bool:
+        """Whether a relative address on the page ``name`` is that of a page or picture."""
+        target = posixpath.normpath(posixpath.join(posixpath.dirname(name), address))
+        return target in self._pages or target in self._pictures
 
     def _title(self, name: str) -> str:
         """Return the first heading of a page, else its name."""

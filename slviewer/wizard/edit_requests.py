@@ -46,7 +46,7 @@ class EditRequests(RequestHandler):
     @request("Removing the support")
     def remove_support(self, *scans: str) -> None:
         """Delete the plane that the object stands on, and all below it, from scans; `undo_edit` undoes it for each."""
-        remove = partial(tasks.remove_support, self._engine.store, list(scans), warn=self._warn)
+        remove = partial(tasks.remove_support, self._engine.store, list(scans), warn=self._warner("scans"))
         self._submit("Removing the support", remove, tasks.describe_removal)
 
     @request("Undoing the edit")

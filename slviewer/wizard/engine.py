@@ -324,7 +324,7 @@ class Engine:
         finally:
             if is_new:
                 for sentence in load_or_save_check(session, capture).warnings():
-                    self.notices.add("warning", f"{capture.name}: {sentence}")
+                    self.notices.add("warning", f"{capture.name}: {sentence}", "frames")
 
     def _judge_pose(self, reader: SessionReader, session: Session, capture: Capture) -> None:
         """Read the features of a target pose, examine its frames, and save both; the next pose is planned meanwhile."""
@@ -338,7 +338,7 @@ class Engine:
         poses = read_stored_poses(session, [capture.name], Board.parse(target), Smoothing(), True, plan_next)
         judged = next(poses)
         if judged.observation is None:
-            self.notices.add("warning", f"{capture.name} cannot be used: {judged.refused}")
+            self.notices.add("warning", f"{capture.name} cannot be used: {judged.refused}", "target-poses")
         self.publisher.mark_changed(session=True)
 
     def _handle_processing_failure(self, reader: SessionReader, capture: Capture, error: BaseException) -> None:

@@ -35,7 +35,7 @@ class ImportRequests(RequestHandler):
             """Import the folder's captures; returns their names."""
             session = store.guarded(report.saving)
             source = expand_user(path)
-            return import_captures(source, session, layout, progress=report, warn=self._warn, **options)
+            return import_captures(source, session, layout, progress=report, warn=self._warner("frames"), **options)
 
         self._submit_import(work)
 
@@ -71,10 +71,10 @@ class ImportRequests(RequestHandler):
                 unpacking = report.within(0, 0.2)
                 source, warnings = unpack(archive, folder, lambda done: unpacking(done, f"unpacking {name}"))
                 for warning in warnings:
-                    self._warn(warning)
+                    self._warner("frames")(warning)
                 return import_captures(
                     source, store.guarded(report.saving), layout, origin=name, progress=report.within(0.2, 1),
-                    warn=self._warn, **options,
+                    warn=self._warner("frames"), **options,
                 )  # fmt: skip
             finally:
                 atomic.discard(staged)

@@ -176,10 +176,10 @@ class MeasureRequests(RequestHandler):
                     tolerance=tolerance_mm,
                     out=ply,
                     progress=report.within(0.05, 0.98),
-                    warn=self._warn,
+                    warn=self._warner("measurements"),
                 )
             for note in ideal.notes:
-                self._warn(f"{ideal.name}: {note}")
+                self._warner("measurements")(f"{ideal.name}: {note}")
             report(1.0, "compared")
             return result
 
@@ -221,7 +221,7 @@ class MeasureRequests(RequestHandler):
 
         def work(report: Reporter) -> str:
             """Write the plan into the exports; returns a sentence with what to do with it."""
-            made = make_plan(store, TOLERANCE_MM, name=store.folder.name, warn=self._warn)
+            made = make_plan(store, TOLERANCE_MM, name=store.folder.name, warn=self._warner("measurements"))
             with staged_export(store, PLAN, report) as path:
                 write_plan(made, path)
             report(1.0, "written")

@@ -45,7 +45,14 @@ class MergeRequests(RequestHandler):
         store = self._engine.store
         chosen = [store.load_capture(name).name for name in names]
         merge = partial(
-            tasks.merge_scans, store, chosen, reference, start=start, angle=angle, picked=picked, warn=self._warn
+            tasks.merge_scans,
+            store,
+            chosen,
+            reference,
+            start=start,
+            angle=angle,
+            picked=picked,
+            warn=self._warner("merge"),
         )
 
         self._submit_merge(merge, partial(tasks.describe_merge, reference), "picked" if picked else start)
@@ -60,8 +67,9 @@ class MergeRequests(RequestHandler):
             text = describe_error(MERGING, error)
             if isinstance(error, Refused) and error.reason in ("overlap", "disagree"):
                 text = f"{text} {_ALTERNATIVES[start]}"
-            engine.set_merge_failure(text, error.reason if isinstance(error, Refused) else None)
-            engine.notices.add("error", text)
+            reason = error.reason if isinstance(error, Refused) else None
+            engine.set_merge_failure(text, reason)
+            engine.notices.add("error", text, f"merge-{reason}" if reason else "merge")
 
         self._submit(MERGING, merge, describe, failed)
 

@@ -23,13 +23,13 @@ class Notices:
         self._latest: deque[Notice] = deque(maxlen=MOST_NOTICES)
         self._count = 0
 
-    def add(self, level: Level, text: str) -> None:
-        """Add a notice and log it, without passwords."""
+    def add(self, level: Level, text: str, section: str = "") -> None:
+        """Add a notice and log it, without passwords; `section`: of the help's page of findings."""
         text = hide_passwords(text)
         log.log({"warning": logging.WARNING, "error": logging.ERROR}.get(level, logging.INFO), "%s", text)
         with self._lock:
             self._count += 1
-            self._latest.append(Notice(self._count, level, text, datetime.now().astimezone()))
+            self._latest.append(Notice(self._count, level, text, datetime.now().astimezone(), section))
         self._changed()
 
     def add_failure(self, action: str, error: BaseException) -> None:

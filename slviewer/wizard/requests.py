@@ -15,9 +15,9 @@ class RequestHandler:
 
     _engine: Engine
 
-    def _warn(self, text: str) -> None:
-        """Add a warning to the notices."""
-        self._engine.notices.add("warning", text)
+    def _warner(self, section: str) -> Callable[[str], None]:
+        """Return a function that adds a warning to the notices, with its section of the help."""
+        return lambda text: self._engine.notices.add("warning", text, section)
 
     def _submit(
         self,

@@ -60,7 +60,7 @@ class ResultRequests(RequestHandler):
         engine, target = self._engine, self._engine.reader.target()
         if not target:
             raise InputError("choose the target first")
-        calibrate = partial(tasks.calibrate_session, engine.store, target, warn=self._warn)
+        calibrate = partial(tasks.calibrate_session, engine.store, target, warn=self._warner("calibration"))
 
         def done(result: CalibrationResult) -> None:
             """Report the result of the calibration, and mark the session as changed."""
@@ -77,7 +77,7 @@ class ResultRequests(RequestHandler):
     @request("Comparing the models")
     def compare_models(self) -> None:
         """Cross-validate the models on the target poses; the best one is then recommended, and used."""
-        compare = partial(tasks.compare_models, self._engine.store, warn=self._warn)
+        compare = partial(tasks.compare_models, self._engine.store, warn=self._warner("calibration"))
         self._submit("Comparing the models", compare, tasks.describe_comparison)
 
     @request("Choosing the model")
@@ -98,7 +98,7 @@ class ResultRequests(RequestHandler):
         """Compare the models on captures of a plane or a sphere; `radius_mm` helps to detect a sphere."""
         store = self._engine.store
         chosen = [store.load_capture(name).name for name in names]
-        verify = partial(tasks.verify_captures, store, chosen, shape, radius_mm, warn=self._warn)
+        verify = partial(tasks.verify_captures, store, chosen, shape, radius_mm, warn=self._warner("scans"))
         self._submit("Verifying", verify, tasks.describe_verifications)
 
     @request("Reconstructing")
@@ -106,7 +106,7 @@ class ResultRequests(RequestHandler):
         """Reconstruct a capture, with the best model unless one is named."""
         store = self._engine.store
         store.load_capture(name)
-        reconstruct = partial(tasks.reconstruct_capture, store, name, model, warn=self._warn)
+        reconstruct = partial(tasks.reconstruct_capture, store, name, model, warn=self._warner("scans"))
         self._submit("Reconstructing", reconstruct, lambda points: f"{name}: {points:,} points")
 
     @request("Aligning")
@@ -121,7 +121,7 @@ class ResultRequests(RequestHandler):
                 engine.notices.add("warning" if placement.T_first_scan is None else "good", placement.text())
             engine.publisher.mark_changed(session=True)
 
-        engine.jobs.submit("Aligning", partial(tasks.place_scans, store, chosen, warn=self._warn), done)
+        engine.jobs.submit("Aligning", partial(tasks.place_scans, store, chosen, warn=self._warner("merge")), done)
 
     @request("Undoing the alignment")
     def undo_alignment(self, name: str) -> None:
@@ -165,7 +165,11 @@ class ResultRequests(RequestHandler):
             if view is None or view.merge is None:
                 raise InputError("there is no merge yet: merge scans first")
             name = view.merge.name
-        self._submit("Exporting", partial(export_file, store, what, name, chosen, plan, texture, warn=self._warn), str)
+        self._submit(
+            "Exporting",
+            partial(export_file, store, what, name, chosen, plan, texture, warn=self._warner("measurements")),
+            str,
+        )
 
     def report(self) -> bool:
         """Write the HTML report into the exports."""

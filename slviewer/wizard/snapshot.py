@@ -48,12 +48,13 @@ class ExposureChange:
 
 @dataclass(frozen=True)
 class Notice:
-    """A message for the operator; `number` increases with each."""
+    """A message for the operator; `number` increases with each. `section`: of the help's page of findings, or none."""
 
     number: int
     level: Level
     text: str
     time: datetime
+    section: str = ""
 
 
 @dataclass(frozen=True)

@@ -69,14 +69,14 @@ class TurnRequests(CaptureRequests, MergeRequests):
                 engine.queue_processing()
                 self._finish_scan(step.name)
 
-            capture_turn(rig, steps, capture_step, recorded, progress, self._warn)
+            capture_turn(rig, steps, capture_step, recorded, progress, self._warner("scans"))
 
         def done(_: None) -> None:
             """Report the captured turn, and queue its merge."""
             names = [step.name for step in recorded_steps(store, turn)]
             engine.notices.add("good", f"{turn}: {len(names)} scans all round")
             if then_merge:
-                merge = partial(tasks.merge_turn, store, names, warn=self._warn)
+                merge = partial(tasks.merge_turn, store, names, warn=self._warner("merge"))
                 self._submit_merge(merge, partial(tasks.describe_turn, names[0]), "turntable")
 
         engine.acquisition.run_task("Scanning all round", work, done)

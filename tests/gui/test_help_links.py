@@ -2,10 +2,12 @@
 
 import posixpath
 import re
+from pathlib import Path
 
 from playwright.sync_api import Browser, Locator, Page, expect
 from wizard_page import SIZE, Opened, button
 
+from slviewer import wizard
 from slviewer.calibration.diagnosis.verdict import CAUSES, Finding, Verdict
 from slviewer.gui.app import App
 from slviewer.gui.calibration_html import verdict_html
@@ -33,6 +35,12 @@ def test_every_finding_has_a_section_and_every_section_a_finding() -> None:
     sections = [title.lower().replace(" ", "-") for title in re.findall(r"(?m)^### (.*)$", text)]
     assert sorted(sections) == sorted(FINDINGS)
     assert {*FINDINGS, *STAGES.values()} <= {*HelpPages().anchors(FINDINGS_PAGE)}
+
+
+def test_every_section_that_notices_name_exists() -> None:
+    sources = [path.read_text("utf-8") for path in (Path(wizard.__path__[0])).glob("*.py")]
+    named = re.findall(r'(?:_warner\(|notices\.add\("warning", .*, )"([^"]+)"\)', "".join(sources))
+    assert len(named) > 10 and {*named} <= {*HelpPages().anchors(FINDINGS_PAGE)}
 
 
 def test_every_step_has_a_section() -> None:

@@ -15,7 +15,8 @@ def folder(tmp_path):
     """Documentation with pages, a picture, and files that are neither."""
     docs = tmp_path / "docs"
     for name, text in {
-        "howto/one.md": "# One\n\n## Set up\n\n[two](../explanation/two.md#set-up) [code](../examples/a.py)\n",
+        "howto/one.md": "# One\n\n## Set up\n\n[two](../explanation/two.md#set-up) [code](../examples/a.py)\n"
+        "![r](rig.png) ![far](http://a.b/c.png)\n",
         "explanation/two.md": "# Two\n\n## Set up\n\n## Set up\n\n### `frames` & light\n\n"
         "| a | b |\n|---|---|\n| 1 | 2 |\n",
         "howto/three.md": "# <b>Three</b>\n\n<script>alert(1)</script> [x](javascript:alert(1)) [w](https://example.org)\n",
@@ -72,6 +73,7 @@ def test_a_page_has_anchors_tables_and_only_links_that_lead_somewhere(folder):
     pages = HelpPages(folder)
     one, two = (pages.file(name).content.decode() for name in ("howto/one.md", "explanation/two.md"))
     assert 'href="../explanation/two.md#set-up"' in one and "a.py" not in one
+    assert 'src="rig.png"' in one and "a.b" not in one and 'alt="far"' in one
     assert pages.anchors("explanation/two.md") == ("two", "set-up", "set-up-1", "frames--light")
     assert all(f'id="{anchor}"' in two for anchor in pages.anchors("explanation/two.md")) and "<td>1</td>" in two
     assert 'href="../howto/one.md"' in two and 'href="../"' in two
