@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from slviewer.errors import UsageError
+from slviewer.errors import InputError, UsageError
 from slviewer.pipeline.export import check_export
 from slviewer.pipeline.export_shapes import merge_name, merged_points, scan_cloud
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings, part, stage
@@ -15,6 +15,7 @@ from slviewer.pipeline.merge import Merge, StartKind, merge
 from slviewer.pipeline.models import ModelName, check_accepted, load_stereo, warn_if_stale
 from slviewer.pipeline.open_session import SessionLike, opened
 from slviewer.pipeline.scan_edits import OFF, refuse_region, resolve_region, restriction_notes
+from slviewer.pipeline.white_balance import balance, measure_white
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.session.mesh_files import write_shape, write_textured
 from slviewer.session.store import Session
@@ -60,6 +61,7 @@ def mesh(
     *,
     plan: MeshingPlan | None = None,
     texture: int | None = None,
+    white: str = "",
     model: ModelName | None = None,
     start: StartKind = "features",
     angle: float | None = None,
@@ -75,6 +77,8 @@ def mesh(
         names: One scan; several, to be merged into the frame of the first; or a merge of the session, as merge/1.
         out: The file; by default a .ply in the session's exports, with a texture a .glb.
         texture: Side of a texture image, px, such as 2048, projected from the scans onto the mesh; for .glb and .obj.
+        white: White balance of a colour camera's texture: board takes the white of the target poses for neutral, any
+            other name that capture, of a grey card or white sheet; by default colours are the camera's.
         start: Initial alignment of several scans: features estimates it from the scans; turntable uses the angles of
             the turntable; identity assumes that they are nearly aligned already.
         angle: Degrees that the turntable turns from each scan to the next, with --start turntable; by default as stored
@@ -100,9 +104,12 @@ def mesh(
             raise UsageError(f"{Path(out).name} holds no texture: end its name in .glb or .obj")
         plan = plan or MeshingPlan()
         plan = plan if plan.triangles is not None else replace(plan, triangles=TEXTURED_TRIANGLES)
+    if white and texture is None:
+        raise UsageError("--white balances the colours of a texture: give --texture too")
     merged = None
     with opened(session) as store:
         check_accepted(store, accept_rejected)
+        gains = measure_white(store, white) if white else None
         suffix = ".ply" if texture is None else ".glb"
         path = Path(out) if out is not None else store.exports / f"{'_'.join(sources).replace('/', '_')}_mesh{suffix}"
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -134,6 +141,8 @@ def mesh(
         progress(1.0, "meshed")
         return MeshResult(meshed, sources, path, merged)
     clouds, poses = {name: each[0] for name, each in scans.items()}, {name: each[1] for name, each in scans.items()}
+    if gains is not None:
+        clouds = {name: _balance_cloud(name, cloud, gains) for name, cloud in clouds.items()}
     painting = stage(progress, 0.6, 0.95, "projecting the scans onto the mesh")
     textured = texture_mesh(meshed.mesh, clouds, poses, size=texture, light=light, progress=painting)
     progress(0.95, f"writing {path.name}")
@@ -165,6 +174,13 @@ def _textured_scans(
         name: (scan_cloud(store, name, used, ignore_progress, warn, accept_rejected, OFF), placed[name])
         for name in meta["scans"]
     }
+
+
+def _balance_cloud(name: str, cloud: Cloud, gains: np.ndarray) -> Cloud:
+    """Return a cloud with a white balance applied to its texture. InputError where that has no colours."""
+    if cloud.texture is None or cloud.texture.ndim != 3:
+        raise InputError(f"the picture of {name} has no colours: make the texture without a white balance")
+    return replace(cloud, texture=balance(cloud.texture, gains))
 
 
 def _projector_place(store: Session) -> np.ndarray:

@@ -37,10 +37,11 @@ def export_file(
     texture: int | None,
     report: Reporter,
     warn: Warn,
+    white: str = "",
 ) -> str:
     """Write one file, as `pipeline.export.export` does; returns a sentence that begins with the file's name.
 
-    ``texture``: side of the image of a mesh, px; None for a mesh without one.
+    ``texture``: side of the image of a mesh, px, None for a mesh without one; ``white``: its white balance.
     """
     accepts, progress = accepts_rejected(session), report.within(0, 0.98)
     if texture is None:
@@ -53,8 +54,9 @@ def export_file(
         source = f"{MERGE}{name}" if what == "merged-mesh" else name
         path = session.exports / default_file_name(what, name, file_format)
         made = mesh(
-            session, [source], path, plan=plan, texture=texture, accept_rejected=accepts, progress=progress, warn=warn
-        )
+            session, [source], path, plan=plan, texture=texture, white=white, accept_rejected=accepts,
+            progress=progress, warn=warn,
+        )  # fmt: skip
         assert made.textured is not None
         words = f"{made.meshed.text().splitlines()[0]}; {made.textured.text()}"
     report(1.0, "exported")

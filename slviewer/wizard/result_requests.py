@@ -149,10 +149,11 @@ class ResultRequests(RequestHandler):
         file_format: str = "",
         plan: MeshingPlan | None = None,
         texture: int | None = None,
+        white: str = "",
     ) -> None:
         """Write a file into the session's exports. `export.FORMATS` lists what can be exported and the formats, the
         first is the default. `name`: the scan of a cloud or a mesh, the model of coefficients; a merge is the current
-        one. `plan`: how to mesh; `texture`: side of its image, px, of a .glb or .obj.
+        one. `plan`: how to mesh; `texture`: side of its image, px, of a .glb or .obj; `white`: its white balance.
         """
         store, view = self._engine.store, self._engine.publisher.refresh().session
         chosen = file_format or FORMATS.get(what, ("",))[0]
@@ -167,7 +168,9 @@ class ResultRequests(RequestHandler):
             name = view.merge.name
         self._submit(
             "Exporting",
-            partial(export_file, store, what, name, chosen, plan, texture, warn=self._warner("measurements")),
+            partial(
+                export_file, store, what, name, chosen, plan, texture, warn=self._warner("measurements"), white=white
+            ),
             str,
         )
 

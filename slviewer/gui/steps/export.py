@@ -18,6 +18,7 @@ from slviewer.pipeline.export import (
     describe_format,
     estimate_file_bytes,
 )
+from slviewer.pipeline.white_balance import BOARD
 from slviewer.session.atomic import format_bytes
 from slviewer.session.mesh_files import MESH_FORMATS, POINT_FORMATS
 from slviewer.surface.meshing import MeshingPlan, Method
@@ -130,6 +131,9 @@ class Panel(StepPanel):
             self._texture: Any = gui.add_dropdown(
                 "Texture", tuple(TEXTURES), hint="An image of the surface, projected from the scans; thins the mesh"
             )
+            self._white = gui.add_checkbox(
+                "White balance", False, hint="Takes the board's white for neutral; for colour cameras"
+            )
             self._shape_note = Text(gui)
             self._shape_link = Text(gui)
             self._shape_result = Text(gui)
@@ -203,6 +207,7 @@ class Panel(StepPanel):
         self._mesh.draw(mesh and bool(name), what == "merged-mesh")
         self._shape_format.offer([(each, FORMAT_NAMES[each]) for each in FORMATS[what]])
         change(self._texture, visible=bool(name) and mesh and self._shape_format.value in TEXTURED_FORMATS)
+        change(self._white, visible=self._texture.visible and TEXTURES[self._texture.value] is not None)
         if name:
             chosen = self._shape_format.value
             file = _get_export(session, default_file_name(what, name, chosen))
@@ -273,7 +278,8 @@ class Panel(StepPanel):
             plan = self._mesh.plan() if what in ("mesh", "merged-mesh") else None
             chosen = self._shape_format.value
             texture = TEXTURES[self._texture.value] if plan is not None and chosen in TEXTURED_FORMATS else None
-            self._operator.export(what, name, chosen, plan, texture)
+            white = BOARD if texture is not None and self._white.value else ""
+            self._operator.export(what, name, chosen, plan, texture, white)
 
     def _request_textured(self) -> None:
         """Choose a mesh with a texture as GLB, and request its file."""
