@@ -1,5 +1,6 @@
 """The tools of the step Measure, their instructions, and the points picked so far."""
 
+from slviewer.inspection.regions import Region
 from slviewer.pipeline.measured_surface import Place
 
 PICK = ("Point", "Distance", "Section")
@@ -17,15 +18,23 @@ _WITHOUT_CLICKS = {
 
 
 class Tool:
-    """The chosen tool, its name empty for none, and the points picked with it."""
+    """The chosen tool, its name empty for none, the points picked with it, and the box drawn for a fit: by a rectangle
+    where ``by_rectangle``, else fits use a ball about the picked point."""
 
     def __init__(self) -> None:
         self.name = ""
         self.picked: list[Place] = []
+        self.by_rectangle = False
+        self.box: Region | None = None
 
     def select(self, name: str) -> None:
-        """Select another tool, or none; picked points are dropped."""
-        self.name, self.picked = name, []
+        """Select another tool, or none; picked points and the box are dropped."""
+        self.name, self.picked, self.box = name, [], None
+
+    @property
+    def has_region(self) -> bool:
+        """Whether there is a region to fit to."""
+        return self.fits and (self.box is not None if self.by_rectangle else bool(self.picked))
 
     @property
     def fits(self) -> bool:
@@ -61,6 +70,9 @@ class Tool:
             return "Choose a tool."
         if self.fits:
             shape = self.name.lower()
+            if self.by_rectangle:
+                end = f", then press Fit {shape}." if self.box is not None else "."
+                return f"Drag a rectangle over the {shape} alone{end}"
             if not self.picked:
                 return f"Click the centre of the {shape}."
             return f"Set the radius so that the ball contains only the {shape}, then press Fit {shape}."

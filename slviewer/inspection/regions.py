@@ -7,16 +7,23 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from slviewer.errors import InputError
+from slviewer.surface.region_of_interest import box_edges
+
+MARGIN_MM = 1e-3
+"""Of a box around points: they lie inside, not on its faces."""
 
 
 @dataclass(frozen=True, eq=False)
 class Region:
-    """The points within a ball (``size`` = (radius,)) or a box with sides along the axes (``size`` = half sides) about
-    ``centre`` (3,), mm."""
+    """The points within a ball (``size`` = (radius,)) or a box (``size`` = half sides) about ``centre`` (3,), mm.
+
+    ``axes`` (3, 3): the directions of a box's sides, one a row; None: those of the coordinates.
+    """
 
     kind: Literal["ball", "box"]
     centre: np.ndarray
     size: np.ndarray
+    axes: np.ndarray | None = None
 
     @classmethod
     def ball(cls, centre: ArrayLike, radius: float) -> "Region":
@@ -29,13 +36,25 @@ class Region:
         a, b = _check_place(low), _check_place(high)
         return cls("box", (a + b) / 2, _check_size(np.abs(b - a) / 2))
 
+    @classmethod
+    def around(cls, points: np.ndarray, axes: np.ndarray) -> "Region":
+        """Return the smallest box with sides along the rows of ``axes`` (3, 3) that holds points (n, 3) mm."""
+        along = points @ axes.T
+        low, high = along.min(axis=0), along.max(axis=0)
+        return cls("box", _check_place((low + high) / 2 @ axes), _check_size((high - low) / 2 + MARGIN_MM), axes)
+
     def within(self, points: np.ndarray) -> np.ndarray:
         """Bool like points (h, w, 3) or (n, 3) without their last axis; False for NaN."""
         finite: np.ndarray = np.isfinite(points).all(axis=-1)
-        offsets = np.where(finite[..., None], points, np.inf) - self.centre
+        offsets = np.where(finite[..., None], points - self.centre, 0.0)
         if self.kind == "ball":
-            return np.asarray(np.linalg.norm(offsets, axis=-1) <= self.size[0])
-        return np.asarray((np.abs(offsets) <= self.size).all(axis=-1))
+            return np.asarray(finite & (np.linalg.norm(offsets, axis=-1) <= self.size[0]))
+        offsets = offsets if self.axes is None else offsets @ self.axes.T
+        return np.asarray(finite & (np.abs(offsets) <= self.size).all(axis=-1))
+
+    def edges(self) -> np.ndarray:
+        """(12, 2, 3) mm: the edges of a box."""
+        return box_edges(self.centre, 2 * self.size, np.eye(3) if self.axes is None else self.axes)
 
     def text(self) -> str:
         """Describe the region."""

@@ -58,8 +58,9 @@ class PlanRegion:
     def of(cls, region: Region, T_part_scan: np.ndarray) -> "PlanRegion":
         """The region of a scan in part coordinates."""
         centre = T_part_scan[:3, :3] @ region.centre + T_part_scan[:3, 3]
-        turned = region.kind == "box" and not np.allclose(T_part_scan[:3, :3], np.eye(3))
-        x, y, z = (_vector(each, 9) for each in T_part_scan[:3, :3].T)
+        directions = (np.eye(3) if region.axes is None else region.axes) @ T_part_scan[:3, :3].T
+        turned = region.kind == "box" and not np.allclose(directions, np.eye(3))
+        x, y, z = (_vector(each, 9) for each in directions)
         return cls(region.kind, _vector(centre), tuple(region.size.tolist()), (x, y, z) if turned else None)
 
 

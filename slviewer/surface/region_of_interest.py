@@ -73,10 +73,8 @@ class RegionOfInterest:
 
     def edges(self) -> NDArray[np.float64]:
         """(12, 2, 3) mm: the edges of the box, in the camera's frame."""
-        corners = np.array(list(product((-0.5, 0.5), repeat=3)))
-        pairs = [(a, b) for a in range(8) for b in range(a) if np.abs(corners[a] - corners[b]).sum() == 1]
         T = self.T_camera_box
-        return np.asarray((corners[np.array(pairs)] * self.size_mm) @ T[:3, :3].T + T[:3, 3])
+        return box_edges(T[:3, 3], np.array(self.size_mm), T[:3, :3].T)
 
     def text(self) -> str:
         """Describe the box: its size, centre, and where it is turned its angles."""
@@ -110,3 +108,10 @@ def _triple(values: np.ndarray) -> Triple:
 def _times(values: Triple) -> str:
     """Format three lengths."""
     return " x ".join(f"{value:.1f}" for value in values)
+
+
+def box_edges(centre: np.ndarray, size: np.ndarray, axes: np.ndarray) -> np.ndarray:
+    """(12, 2, 3) mm: the edges of a box of sides ``size`` (3,) along the rows of ``axes`` (3, 3)."""
+    corners = np.array(list(product((-0.5, 0.5), repeat=3)))
+    pairs = [(a, b) for a in range(8) for b in range(a) if np.abs(corners[a] - corners[b]).sum() == 1]
+    return np.asarray((corners[np.array(pairs)] * size) @ axes + centre)

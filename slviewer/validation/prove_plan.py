@@ -18,7 +18,8 @@ from slviewer.validation.proof import BandCheck, Proof, prove_checks
 REPEATS = 200
 NOISE_MM = 0.02
 BAND = (93.0, 97.0)
-"""Percent of the repeats in which U (k = 2) must cover the truth."""
+"""Percent of the repeats in which U (k = 2) must cover the truth, give or take the standard deviation that so many
+repeats have."""
 SIDE = 55
 """Points along either direction of a region, in a grid as a camera sees them."""
 FORM_MM, DECAY = 0.03, 0.7
@@ -45,7 +46,9 @@ def prove_plan(
         truths, U = np.array([truth for truth, _ in cases]), np.array([q.U or 0.0 for _, q in cases])
         errors = np.array([q.value for _, q in cases]) - truths
         covered = 100 * float(np.mean(np.abs(errors) <= U))
-        checks.append(BandCheck(kind, f"% of {repeats} repeats covered by U (k = 2)", covered, *BAND))
+        chance = 100 * float(np.sqrt(0.95 * 0.05 / repeats))
+        least, most = BAND[0] - chance, BAND[1] + chance
+        checks.append(BandCheck(kind, f"% of {repeats} repeats covered by U (k = 2)", covered, least, most))
         rows.append(
             {
                 "characteristic": kind,

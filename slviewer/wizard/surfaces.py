@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from slviewer.errors import InputError
+from slviewer.inspection.regions import Region
 from slviewer.pipeline.measured_surface import MERGED, MeasuredSurface, Place, load_merged_surface, surface_from_cloud
 from slviewer.pipeline.models import load_model
 from slviewer.pipeline.scale import scale_factor
@@ -14,6 +15,7 @@ from slviewer.reconstruction.cloud import Cloud
 from slviewer.session.nominal import NOMINALS
 from slviewer.session.scan_edits import load_region, restriction_inputs
 from slviewer.session.store import Session
+from slviewer.surface.selection import ViewCamera, select_connected, select_in_outline
 from slviewer.wizard.result_views import nearest
 
 
@@ -72,6 +74,21 @@ def point_at(on: MeasuredSurface, place: Place) -> np.ndarray:
     """Return the point (3,) mm of a place on the surface."""
     index = (place[1], place[0]) if isinstance(place, tuple) else (place,)
     return np.asarray(on.points[index], np.float64)
+
+
+def box_in_view(on: MeasuredSurface, view: ViewCamera, low: np.ndarray, high: np.ndarray) -> Region:
+    """Return the box, with sides along a view's, around what a rectangle shows of a surface: its connected part in the
+    middle. ``low``, ``high`` (2,): corners in the view, 0 ... 1. InputError where it shows no measured point.
+    """
+    corners = np.array([low, [high[0], low[1]], high, [low[0], high[1]]])
+    chosen = select_in_outline(on.points, view, corners) & on.measured
+    if not chosen.any():
+        raise InputError("the rectangle holds no measured point: drag it over the surface")
+    if on.organised:
+        off = np.linalg.norm(view.project(on.points.astype(np.float64)) - (low + high) / 2, axis=-1)
+        v, u = np.unravel_index(int(np.argmin(np.where(chosen, off, np.inf))), chosen.shape)
+        chosen = select_connected(on.points, (int(u), int(v)), chosen)
+    return Region.around(on.points[chosen].astype(np.float64), view.R_scene_view.T)
 
 
 def list_nominals(folder: Path) -> tuple[str, ...]:

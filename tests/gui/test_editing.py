@@ -17,9 +17,7 @@ from slviewer.devices.simulated import simulated_rig
 from slviewer.devices.world import SimulatedWorld
 from slviewer.gui.app import App
 from slviewer.gui.scene import read_view
-from slviewer.inspection.regions import Region
 from slviewer.pipeline.capture import capture
-from slviewer.pipeline.measurements import add_fit
 from slviewer.pipeline.rig_choice import RigSetup
 from slviewer.server.secure import Serving
 from slviewer.session.inspection_plan import OWN_PLAN, read_plan, write_plan
@@ -283,14 +281,29 @@ def test_a_plan_is_made_uploaded_and_run_on_two_scans(tmp_path: Path, browser: B
             operator.reconstruct(name)
             operator.wait_until_idle()
         top = world.pose.t - [0.0, 0.0, 98.0]
-        assert operator.measure("a", add_fit, "sphere", Region.ball(top, 60.0))
-        operator.wait_until_idle()
         app = App(operator, Serving(port=0))
         page = browser.new_page(viewport=SIZE)
         page.set_default_timeout(20_000)
         opened = Opened(page)
         page.goto(app.server.link())
         button(page, "8. Measure").click()
+        page.wait_for_timeout(2500)  # the view moves to the surface
+        page.get_by_text("Sphere", exact=True).click()
+        choose(page, "Region", "rectangle")
+        page.wait_for_timeout(500)
+        x, y = to_screen(app, page, top)
+        page.mouse.move(x - 50, y - 50)
+        page.mouse.down()
+        page.mouse.move(x, y, steps=4)
+        page.mouse.move(x + 50, y + 50, steps=4)
+        page.mouse.up()
+        expect(page.get_by_text(re.compile(r"[\d,]+ points in the box"))).to_be_visible()
+        button(page, "Fit sphere").click()
+        wait_until(page, lambda: len(operator.snapshot().session.measurements) == 1)  # type: ignore[union-attr]
+        (fitted,) = operator.snapshot().session.measurements  # type: ignore[union-attr]
+        radius = fitted.data["quantities"][0]
+        assert abs(radius["value"] - 98.0) < 1.5 and "box" in fitted.data["where"]
+        button(page, "End tool").click()
         button(page, "Make plan").click()
         wait_until(page, lambda: operator.snapshot().session.plans == (OWN_PLAN,))  # type: ignore[union-attr]
         unfold(page, "Inspection plan")

@@ -9,6 +9,7 @@ from slviewer.inspection.fitting import fit_feature
 from slviewer.inspection.form import form_error, orientation_error, position_error, profile_error
 from slviewer.inspection.quantities import Quantity
 from slviewer.inspection.tolerance import judge_limits
+from slviewer.validation.prove_plan import CASES
 
 N, NOISE = 3000, 0.02
 
@@ -110,3 +111,21 @@ def test_too_few_points_are_refused() -> None:
 def test_limits_are_decided_with_a_guard_band(value: float, decision: str) -> None:
     assert judge_limits(value, 0.1, 4.0, 6.0) == decision
     assert judge_limits(float("nan"), 0.1, 4.0, 6.0) == "undecided"
+
+
+@pytest.mark.parametrize("kind", ["flatness", "roundness", "cylindricity", "parallelism", "position", "profile"])
+def test_uncertainty_covers_the_truth_of_drawn_parts(kind: str) -> None:
+    cases = [CASES[kind](40, np.random.default_rng([77, i])) for i in range(30)]
+    errors = np.array([(q.value - truth) / (q.U or np.inf) for truth, q in cases])
+    assert np.mean(np.abs(errors) <= 1) >= 0.8  # 95 % of 30, less five standard deviations
+    assert 0.25 < np.sqrt(np.mean(errors**2)) < 0.85  # half of U is one standard deviation
+
+
+def test_dense_and_sparse_parts_of_a_region_weigh_by_area() -> None:
+    rng = np.random.default_rng(3)
+    u, v = rng.uniform(-20, 20, (2, 6000))
+    kept = (u < 0) | (rng.uniform(size=6000) < 0.2)  # five times as many points on the left
+    u, v = u[kept], v[kept]
+    points = np.column_stack([u, v, 0.05 * (u / 20) ** 2 + 0.002 * rng.normal(size=len(u))])
+    q = form_error("flatness", fit_feature("plane", points), points)
+    assert abs(q.value - 0.05) < 0.004

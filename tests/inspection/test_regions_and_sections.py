@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from slviewer.errors import InputError
 from slviewer.inspection.regions import Region
@@ -19,7 +20,8 @@ def test_regions_hold_the_points_they_were_made_of() -> None:
     ball, box = Region.ball([0, 0, 0], 3.0), Region.box([1, 1, 1], [-2, -2, -2])
     assert np.array_equal(ball.within(points), finite & (np.linalg.norm(np.nan_to_num(points), axis=-1) <= 3))
     assert np.array_equal(box.within(points), finite & ((points >= -2) & (points <= 1)).all(axis=-1))
-    assert to_plain(Region.ball([1, 2, 3], 4.0)) == {"kind": "ball", "centre": [1.0, 2.0, 3.0], "size": [4.0]}
+    plain = {"kind": "ball", "centre": [1.0, 2.0, 3.0], "size": [4.0], "axes": None}
+    assert to_plain(Region.ball([1, 2, 3], 4.0)) == plain
 
 
 def test_regions_that_cannot_be_are_refused() -> None:
@@ -80,3 +82,17 @@ def test_sections_that_cannot_be_are_refused() -> None:
         CutPlane.through([0, 0, 0], [0, 5, 0], [0, 1, 0])
     with pytest.raises(InputError, match="line"):
         radius_through(np.zeros(2), np.ones(2), 3 * np.ones(2))
+
+
+def test_a_box_along_a_view_holds_its_points_and_keeps_its_axes() -> None:
+    axes = Rotation.from_rotvec([0.3, -0.5, 0.8]).as_matrix()
+    rng = np.random.default_rng(1)
+    inside = rng.uniform(-1, 1, (500, 3)) * [10, 5, 2] @ axes + [4, 5, 600]
+    region = Region.around(inside, axes)
+    assert region.within(inside).all()
+    assert np.sort(region.size) == pytest.approx([2, 5, 10], rel=0.02)
+    beyond = np.array([[11.0, 0, 0], [0, 6, 0], [0, 0, 3]]) @ axes + [4, 5, 600]
+    assert not region.within(beyond).any()
+    stored = from_plain({k: v for k, v in to_plain(region).items()}, Region)
+    assert np.allclose(stored.axes, axes) and stored.within(inside).all()
+    assert np.linalg.norm(region.edges()[:, 0] - region.edges()[:, 1], axis=1).max() == pytest.approx(20, rel=0.02)

@@ -20,12 +20,15 @@ from slviewer.pipeline.measurements import Shape, add_distance, add_fit, add_poi
 from slviewer.report.canvas import round_up
 from slviewer.session.measurements import Measurement
 from slviewer.session.nominal import MM
+from slviewer.surface.selection import ViewCamera
 from slviewer.wizard.snapshot import SessionView, Snapshot
-from slviewer.wizard.surfaces import point_at
+from slviewer.wizard.surfaces import box_in_view, point_at
 
 LAYER = "measure"
 UNKNOWN = "unknown"
-_BALL = "ball"
+BALL, RECTANGLE = "ball", "rectangle"
+BOX_COLOUR = (20, 150, 140)
+_BALL, _BOX = "ball", "box"
 _PICKED = ("picked 1", "picked 2")
 _MEASURES: dict[str, Any] = {"Point": add_point, "Distance": add_distance, "Section": add_section}
 
@@ -66,6 +69,8 @@ class Panel(StepPanel):
 
     def _build_fit(self) -> None:
         """Create the inputs to fit a shape: radius of the region, and a button."""
+        self._by: Any = self._gui.add_dropdown("Region", (BALL, RECTANGLE), visible=False)
+        self._by.on_update(self._context.callback(self._change_region))
         hint = "Of the ball in 3D"
         self._radius: Any = self._gui.add_slider("Radius, mm", 0.5, 100.0, 0.5, 15.0, visible=False, hint=hint)
         self._radius.on_update(self._context.callback(self._draw_ball))
@@ -123,6 +128,7 @@ class Panel(StepPanel):
             self._visible = visible
             self._surface.show(visible)
             self._scene.on_pick(None)
+            self._scene.on_rectangle(None)
             change(self._escape, disabled=True)
 
     # tools
@@ -138,7 +144,27 @@ class Panel(StepPanel):
         """React to clicks into the scene while the tool needs them; another step handles its own clicks."""
         if self._visible:
             change(self._escape, disabled=not self._tool.name)
-            self._scene.on_pick(self._handle_click if self._tool.clicks else None)
+            rectangle = self._tool.fits and self._tool.by_rectangle
+            self._scene.on_rectangle(self._handle_rectangle if rectangle else None)
+            self._scene.on_pick(self._handle_click if self._tool.clicks and not rectangle else None)
+
+    def _change_region(self) -> None:
+        """Take clicks or rectangles, as the operator chose."""
+        with self._lock:
+            self._tool.by_rectangle = self._by.value == RECTANGLE
+            self._select_tool(self._tool.name)
+
+    def _handle_rectangle(self, view: ViewCamera, low: np.ndarray, high: np.ndarray) -> None:
+        """Take the box around what a dragged rectangle shows."""
+
+        def take() -> None:
+            """Set the box, and draw it."""
+            with self._lock:
+                if self._surface.on is not None and self._tool.fits:
+                    self._tool.box = box_in_view(self._surface.on, view, low, high)
+                    self._draw_tool()
+
+        self._context.callback(take)(None)
 
     def _handle_click(self, origin: np.ndarray, direction: np.ndarray) -> None:
         """Pick the point of the surface that a clicked ray meets."""
@@ -162,9 +188,10 @@ class Panel(StepPanel):
         text = Html(title + to_html(tool.instruction))
         self._instruction.set(alert(text, "info") if tool.name else paragraph(coloured(text, "dim")))
         change(self._end, visible=bool(tool.name))
-        change(self._radius, visible=tool.fits)
+        change(self._by, visible=tool.fits)
+        change(self._radius, visible=tool.fits and not tool.by_rectangle)
         label = f"Fit {tool.name.lower()}" if tool.fits else "Fit"
-        change(self._fit, visible=tool.fits and bool(tool.picked), label=label)
+        change(self._fit, visible=tool.has_region, label=label)
         relation, deviation = (tool.name == name for name in COMPARE)
         for choice in (self._from, self._to):
             choice.set_visible(relation)
@@ -183,26 +210,32 @@ class Panel(StepPanel):
         """Draw the region that a shape would be fitted to, and request its number of points."""
         with self._lock:
             on, region = self._surface.on, self._make_region()
-            if on is None or region is None or region.centre is None:
+            for name in (_BALL, _BOX):
+                if region is None or name != (_BALL if region.kind == "ball" else _BOX):
+                    self._scene.remove(LAYER, name)
+            if on is None or region is None:
                 self._painter.cancel("inside")
-                self._scene.remove(LAYER, _BALL)
                 self._inside.set("")
                 return
-            radius = float(self._radius.value)
-            self._scene.ball(LAYER, _BALL, region.centre, radius, GHOST)
-            key = (self._surface.name, tuple(region.centre), radius)
+            if region.kind == "ball":
+                self._scene.ball(LAYER, _BALL, region.centre, float(region.size[0]), GHOST)
+            else:
+                self._scene.lines(LAYER, _BOX, region.edges(), BOX_COLOUR)
+            key = (self._surface.name, region.text())
             self._painter.request(
                 "inside",
                 key,
                 lambda: len(on.within(region)),
-                lambda points: self._inside.write(f"{points:,} points in the ball", "dim"),
+                lambda points: self._inside.write(f"{points:,} points in the {region.kind}", "dim"),
             )
 
     def _make_region(self) -> Region | None:
-        """Return the ball around the picked point; None unless the tool fits a shape and has one."""
+        """Return the ball around the picked point, or the box that was drawn; None unless the tool fits and has one."""
         on = self._surface.on
-        if on is None or not self._tool.fits or not self._tool.picked:
+        if on is None or not self._tool.has_region:
             return None
+        if self._tool.by_rectangle:
+            return self._tool.box
         return Region.ball(point_at(on, self._tool.picked[0]), float(self._radius.value))
 
     # the surface and the results
