@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 
 from slviewer.errors import InputError
 from slviewer.evaluation.capability import process_capability
@@ -149,3 +150,46 @@ def test_capability_of_known_spread() -> None:
     assert 0.9 * 1.5 < c.cp[0] < 1.1 * 1.5
     assert process_capability([1.0, 1.0, 1.0], 0.0, 2.0) is None
     assert process_capability([1.0, 2.0], 0.0, 2.0) is None
+
+
+def test_a_plan_by_best_fit_measures_profiles_from_the_nominal_model(tmp_path: Path) -> None:
+    """The nominal is a block with one sloping side; the part lies elsewhere, with a dent of 0.2 mm in its top."""
+    mesh = trimesh.creation.box((80.0, 60.0, 40.0))
+    low = mesh.vertices[:, 2] < 0
+    mesh.vertices[low] += np.column_stack([np.where(mesh.vertices[low, 0] > 0, 25.0, 0.0), *np.zeros((2, low.sum()))])
+    mesh.export(tmp_path / "box.stl")
+    features = (
+        PlanFeature(
+            "top", "plane", PlanRegion("box", (20.0, 0.0, 20.0), (17.0, 27.0, 3.0)), (20.0, 0.0, 20.0), (0, 0, 1)
+        ),
+        PlanFeature("sound", "surface", PlanRegion("box", (20.0, 0.0, 20.0), (17.0, 27.0, 3.0))),
+        PlanFeature("dented", "surface", PlanRegion("box", (-20.0, 0.0, 20.0), (17.0, 27.0, 3.0))),
+    )
+    characteristics = (
+        Characteristic("sound profile", "profile", ("sound",), upper=0.1),
+        Characteristic("dented profile", "profile", ("dented",), upper=0.1),
+        Characteristic("top position", "position", ("top",), upper=0.1),
+    )
+    plan = Plan("box", features, characteristics, Alignment("best fit", "box.stl"))
+    write_plan(plan, tmp_path / "plan.toml")
+    read = read_plan(tmp_path / "plan.toml")
+
+    def load(report: object) -> MeasuredSurface:
+        rng = np.random.default_rng(5)
+        points, faces = trimesh.sample.sample_surface(mesh, 16000, seed=5)
+        seen = mesh.face_normals[faces][:, 2] > -0.5
+        points, normals = np.array(points)[seen], mesh.face_normals[faces][seen]
+        dent = 0.2 * np.exp(-((points[:, 0] + 20) ** 2 + points[:, 1] ** 2) / 60) * (normals[:, 2] > 0.9)
+        points += (NOISE * rng.normal(size=len(points)) - dent)[:, None] * normals
+        points = move_points(POSE, points).astype(np.float32)
+        return MeasuredSurface(points, np.full(len(points), NOISE, np.float32), "box", "splined", {})
+
+    result = inspect_surfaces(read, [("one", load)])
+    sound, dented, top = result.parts[0].results
+    assert [each.reason for each in (sound, dented, top)] == ["", "", ""]
+    assert [each.decision for each in (sound, dented)] == ["pass", "fail"]
+    # the smooth part flattens a dent this narrow, and the best fit takes a little of it
+    assert dented.value is not None and 0.25 < dented.value < 0.45
+    assert top.value is not None and top.U is not None and top.value < 0.05 + top.U
+    page = write_inspection(result, tmp_path / "out").files[0].read_text()
+    assert "in part coordinates.</footer>" in page and "camera&#39;s frame.</footer>" not in page
