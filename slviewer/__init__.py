@@ -63,7 +63,10 @@ if TYPE_CHECKING:
     from slviewer.target.board import Board
     from slviewer.target.detect import detect as detect_board
 
-__version__ = "0.1.0"
+try:  # written by the build from the git tag
+    from slviewer._version import version as __version__
+except ImportError:  # a checkout that was never built or installed
+    __version__ = "0.2.0.dev0"
 
 _EXPORTS = {
     "Board": "target.board",

@@ -1,0 +1,96 @@
+"""The release: what sdist and wheel hold, and whether an installed wheel works outside of the checkout."""
+
+import os
+import re
+import subprocess
+import sys
+import sysconfig
+import tarfile
+import tomllib
+import venv
+import zipfile
+from pathlib import Path
+
+import pytest
+
+import slviewer
+
+ROOT = Path(__file__).parents[1]
+
+
+def run(*command: str | Path, cwd: Path) -> str:
+    """Return the standard output of a command that must succeed; it sees no checkout and no settings of ours."""
+    environment = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "PYTHONHOME")}
+    done = subprocess.run([str(part) for part in command], cwd=cwd, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, f"{command}: {done.stderr[-2000:]}"
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory) -> tuple[Path, Path]:
+    """An sdist, and a wheel that was built from it; needs no network."""
+    for needed in ("build", "hatchling", "hatch_vcs"):
+        pytest.importorskip(needed)
+    folder = tmp_path_factory.mktemp("dist")
+    version_file = ROOT / "slviewer" / "_version.py"
+    before = version_file.read_bytes() if version_file.exists() else None
+    try:
+        run(sys.executable, "-m", "build", "--no-isolation", "--outdir", folder, ROOT, cwd=folder)
+    finally:  # the build writes the version into the checkout
+        if before is not None:
+            version_file.write_bytes(before)
+        else:
+            version_file.unlink(missing_ok=True)
+    (sdist,), (wheel,) = folder.glob("*.tar.gz"), folder.glob("*.whl")
+    return sdist, wheel
+
+
+def test_the_version_without_git_is_the_same_in_the_build_and_in_the_package() -> None:
+    fallback = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["tool"]["hatch"]["version"]
+    source = (ROOT / "slviewer" / "__init__.py").read_text("utf-8")
+    assert re.findall(r'__version__ = "(.+)"', source) == [fallback["fallback-version"]]
+    assert re.fullmatch(r"\d+\.\d+\.\d+[\w.+]*", slviewer.__version__)
+
+
+@pytest.mark.slow
+def test_an_sdist_holds_sources_docs_tests_and_assets_and_no_caches(built) -> None:
+    with tarfile.open(built[0]) as archive:
+        names = {name.partition("/")[2] for name in archive.getnames()}
+    wanted = "README.md LICENSE SECURITY.md CHANGELOG.md CITATION.cff pyproject.toml docs/architecture.md"
+    assert {*wanted.split(), "tests/test_release.py", "assets/rigs/webcam.toml", "slviewer/py.typed"} <= names
+    assert not [name for name in names if re.search(r"__pycache__|\.venv|\.git/|_cache|^dist/|\.zarr", name)]
+
+
+@pytest.mark.slow
+def test_a_wheel_works_without_the_checkout(built, tmp_path) -> None:
+    with zipfile.ZipFile(built[1]) as archive:
+        names = set(archive.namelist())
+    data = "report/page.html.j2 report/page.css server/login.html server/projector.html server/camera.html py.typed"
+    assert {f"slviewer/{name}" for name in (*data.split(), "assets/rigs/webcam.toml", "_version.py")} <= names
+    assert not [name for name in names if not name.startswith(("slviewer/", "slviewer-"))]
+
+    # The wheel in an environment of its own; its dependencies are those of this environment, which need no network.
+    venv.create(tmp_path / "venv", with_pip=False)
+    site = run(_python(tmp_path), "-c", "import sysconfig; print(sysconfig.get_path('purelib'))", cwd=tmp_path).strip()
+    with zipfile.ZipFile(built[1]) as archive:
+        archive.extractall(site)
+    Path(site, "dependencies.pth").write_text(sysconfig.get_path("purelib") + "\n", "utf-8")
+    version = built[1].name.split("-")[1]
+    show = "import slviewer as s, importlib.metadata as m; print(s.__file__, s.__version__, m.version('slviewer'))"
+    where, *versions = run(_python(tmp_path), "-c", show, cwd=tmp_path).split()
+    assert Path(where).is_relative_to(site) and versions == [version, version]
+
+    def slviewer_command(*arguments: str) -> str:
+        return run(_python(tmp_path), "-m", "slviewer.cli", *arguments, cwd=tmp_path)
+
+    assert slviewer_command("--version").split() == ["slviewer", version]
+    slviewer_command("simulate", "s", "--scale", "0.15")
+    slviewer_command("calibrate", "s", "--target", "circles:21x16:9")
+    slviewer_command("reconstruct", "s", "plane_01", "--out", "plane.ply")
+    slviewer_command("mesh", "s", "plane_01", "--out", "plane.stl")
+    assert (tmp_path / "plane.ply").read_bytes()[:3] == b"ply" and (tmp_path / "plane.stl").stat().st_size > 10_000
+
+
+def _python(folder: Path) -> Path:
+    """Return the interpreter of the environment in ``folder``."""
+    return folder / "venv" / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
