@@ -150,6 +150,7 @@ COMMANDS = Commands(
 
 def main(arguments: list[str] | None = None) -> int:
     """Run one command; returns its exit status."""
+    terminal.accept_all_characters()
     arguments = sys.argv[1:] if arguments is None else arguments
     if not arguments:
         arguments = ["wizard"]

@@ -1,8 +1,16 @@
 """Progress and messages of a command, on standard error."""
 
+import io
 import sys
 
 from slviewer.printable import escape_controls
+
+
+def accept_all_characters() -> None:
+    """Let the standard streams replace what their encoding lacks, such as an arrow in Windows' code pages."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace" if stream is sys.stderr else "replace")
 
 
 def progress(done: float, doing: str) -> None:

@@ -22,7 +22,7 @@ from slviewer.pipeline.suggest_exposure import BUDGET_S, MAX_SUGGESTED, apply_su
 from slviewer.records import to_plain
 from slviewer.session.atomic import format_bytes
 from slviewer.session.capture import Capture, Role, TurnStep
-from slviewer.session.names import safe_name
+from slviewer.session.names import new_name
 from slviewer.session.store import Session
 from slviewer.target.board import Board
 
@@ -77,7 +77,7 @@ def capture(
         raise InputError("the exposure was given in several ways: give one, several, or let it be chosen")
     exposures = check_exposures(exposures_ms) if exposures_ms else []
     target = None if board is None else Board.parse(board)
-    safe_name(name)
+    new_name(name)
     with opened_or_made(session) as store:
         if name in store.taken_names() and not force:
             raise InputError(f"there is a capture {name!r} already: choose another name, or replace it with --force")

@@ -22,6 +22,8 @@ from slviewer.server.responses import HELP_POLICY, harden, page_policy, respond,
 logger = logging.getLogger("slviewer.server")
 
 LOGIN = "/login"
+HEALTH = "/healthz"
+"""Answered with 204 and nothing else, without a link: the server runs. Limits and checks of hosts hold for it too."""
 DEVICE_PATHS: dict[str, Role] = {"projector": "project", "camera": "camera"}
 """Below the operator's path: they lead to the page of a device with the rights of that page alone."""
 _HTML = "text/html; charset=utf-8"
@@ -94,6 +96,8 @@ class AuthMiddleware:
         if not websocket and path == "/":
             return self._page(self._login_page, page_policy(self._login_page, host))
         if not websocket and path == "/favicon.ico":  # browsers ask by themselves, and would report that there is none
+            return self._empty()
+        if not websocket and path == HEALTH:
             return self._empty()
         if not websocket and path == LOGIN:
             return self._log_in(connection, request)

@@ -4,6 +4,7 @@ import contextlib
 import ipaddress
 import logging
 import socket
+import sys
 import time
 from collections import Counter
 from http import HTTPStatus
@@ -170,6 +171,8 @@ def address_group(address: str) -> str:
 
 def raise_descriptor_limit() -> None:
     """Let this process open 1,024 files where it may: some systems start with fewer than all limits together need."""
+    if sys.platform == "win32":
+        return
     with contextlib.suppress(ImportError, ValueError, OSError):
         import resource
 

@@ -25,11 +25,14 @@ from slviewer.session.reading import decoding, read_json
 
 _LEFTOVER = re.compile(r"\.(?P<name>.+)\.(?P<state>tmp|done|new)-\d+-[0-9a-f]+")
 _TOGETHER = "together"
+_SYNCS_FOLDERS = os.name != "nt"
 _SPARE_BYTES = 1 << 20  # metadata, folders, the file system's own rounding
 
 
 def sync_folder(folder: Path) -> None:
-    """Sync a folder to disk, so that the names in it survive a power failure."""
+    """Sync a folder to disk, so that the names in it survive a power failure; Windows opens no folders for that."""
+    if not _SYNCS_FOLDERS:
+        return
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(descriptor)

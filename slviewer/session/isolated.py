@@ -34,6 +34,8 @@ def run_isolated(module: str, *arguments: str, data: bytes = b"", cpu_s: int = 1
 
 def limit_process() -> None:
     """Limit memory and processor time of this process, where the system can."""
+    if sys.platform == "win32":
+        return
     with suppress(ImportError, ValueError, OSError):
         import resource
 

@@ -5,6 +5,8 @@ import re
 from slviewer.errors import InputError
 
 _SAFE = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,127}")
+_DEVICE = re.compile(r"(?i:con|prn|aux|nul|com\d|lpt\d)(\..*)?")
+"""Names that Windows keeps for devices, with any suffix."""
 
 
 def safe_name(name: str) -> str:
@@ -20,6 +22,14 @@ def safe_name(name: str) -> str:
 def is_safe_name(name: str) -> bool:
     """Whether `safe_name` accepts the name."""
     return isinstance(name, str) and _SAFE.fullmatch(name) is not None and not name.endswith(".")
+
+
+def new_name(name: str) -> str:
+    """Return a `safe_name` for something new: none that Windows keeps for a device, so that sessions can be copied
+    there. Raises InputError otherwise. What has such a name already can be read."""
+    if _DEVICE.fullmatch(safe_name(name)):
+        raise InputError(f"{name!r} cannot be a name: Windows keeps it for a device: choose another one")
+    return name
 
 
 def safe_path(name: str) -> str:

@@ -23,7 +23,7 @@ from slviewer.session.capture import (
 )
 from slviewer.session.decisions import Decisions
 from slviewer.session.lock import WriterLock
-from slviewer.session.names import is_safe_name, natural_key, safe_name, safe_path
+from slviewer.session.names import is_safe_name, natural_key, new_name, safe_name, safe_path
 from slviewer.session.reading import decoding, expand_user
 from slviewer.session.results import check_place, check_result, list_results, read_arrays, read_meta, write_result
 from slviewer.session.trash import Trashed, list_trash, trash_place
@@ -416,7 +416,7 @@ class Session(Decisions):
     def save_rig(self, name: str, text: str) -> Path:
         """Keep the operator's own rig, TOML, in place of one of that name; returns its file."""
         self._require_writer()
-        path = self.folder / "rigs" / f"{safe_name(name)}.toml"
+        path = self.folder / "rigs" / f"{new_name(name)}.toml"
         atomic.replace_file(path, text.encode())
         return path
 
@@ -464,7 +464,7 @@ class Session(Decisions):
     def _stage(self, capture: NewCapture, role: Role, board: str | None, force: bool) -> Path:
         """Write a capture next to its place, and return the folder, which `atomic.commit` renames."""
         self._require_writer()
-        target = self._capture_folder(capture.name)
+        target = self._capture_folder(new_name(capture.name))
         if target.exists() and not force:
             raise InputError(
                 f"there is a capture {capture.name!r} already: choose another name, or replace it with --force"

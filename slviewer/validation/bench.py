@@ -1,6 +1,5 @@
 """Benchmark of the main stages, with lower bounds of their duration."""
 
-import resource
 import sys
 import tempfile
 import tracemalloc
@@ -129,11 +128,19 @@ def bench(
     memory = None
     if calibration:
         rows += _time_calibration(scale, part(progress, 0.4, 1.0))
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-        memory = peak / (1e9 if sys.platform == "darwin" else 1e6)
+        memory = _peak_memory()
     progress(1.0, "measured")
     streamed = live_rate(0.5 * scale, 60 * minutes, progress) if live else None
     return Benchmark(rows + peers, memory, absent, streamed)
+
+
+def _peak_memory() -> float | None:
+    """Return the most memory that this process ever used, GB; None where the system does not report it."""
+    if sys.platform == "win32":
+        return None
+    import resource
+
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1e9 if sys.platform == "darwin" else 1e6)
 
 
 def _time_decoding(sequence: PatternSequence, frames: np.ndarray) -> tuple[list[Row], float]:

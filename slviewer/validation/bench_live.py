@@ -1,9 +1,9 @@
 """How fast live clouds reach those who look, measured with the wizard itself and with viewers on real connections."""
 
 import contextlib
-import resource
 import socket
 import statistics
+import sys
 import tempfile
 import threading
 import time
@@ -259,6 +259,10 @@ def _get_last_notice(operator: Operator) -> str:
 
 def _measure_use() -> tuple[float, float, float]:
     """Memory, MB, open files and threads of this process; NaN where the system does not report them."""
+    if sys.platform == "win32":
+        return (float("nan"),) * 3
+    import resource
+
     try:
         pages, files = int(Path("/proc/self/statm").read_text().split()[1]), len(list(Path("/proc/self/fd").iterdir()))
     except OSError:

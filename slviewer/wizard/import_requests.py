@@ -10,7 +10,7 @@ from slviewer.errors import InputError
 from slviewer.pipeline.import_captures import import_captures
 from slviewer.session import atomic
 from slviewer.session.importers.archive import unpack, unpacked_size
-from slviewer.session.names import safe_name
+from slviewer.session.names import new_name
 from slviewer.session.reading import expand_user
 from slviewer.wizard.jobs import Reporter
 from slviewer.wizard.requests import RequestHandler, request
@@ -83,4 +83,4 @@ class ImportRequests(RequestHandler):
 def _make_capture_name(name: str) -> str:
     """Return a valid capture name, ASCII and at most 100 characters, made from the name of an upload."""
     plain = "".join(c if (c.isalnum() and c.isascii()) or c in "_-." else "_" for c in name).strip("._-")
-    return safe_name(plain[:100] or "capture")
+    return new_name(plain[:100] or "capture")

@@ -183,6 +183,13 @@ def test_a_file_of_no_tokens_is_refused(tmp_path, content):
         serve(Serving(port=0, token_file=file))
 
 
+def test_health_is_answered_without_a_link_and_discloses_nothing(server, stranger):
+    answer = stranger.get("/healthz")
+    assert (answer.status, answer.content) == (204, b"") and not {"Set-Cookie", "Server"} & set(answer.headers)
+    assert stranger.get("/healthz", Origin=EVIL).status == 403
+    assert stranger.get("/healthz?x").status == 400 and stranger.get("/healthz/x").status == 403
+
+
 ROUTES = {
     "": {"operate": 200, "watch": 200, "project": 200, "camera": 200},
     "favicon.ico": {"operate": 204, "watch": 204, "project": 204, "camera": 204},

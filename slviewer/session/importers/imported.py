@@ -11,7 +11,7 @@ from slviewer.errors import InputError
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.session.capture import NewCapture
 from slviewer.session.importers.images import DEFAULT_CHANNEL, IMAGE_SUFFIXES, Channel, read_frames
-from slviewer.session.names import natural_key, safe_name
+from slviewer.session.names import natural_key, new_name
 from slviewer.session.reading import expand_user
 
 _MOST_REASONS = 3
@@ -202,7 +202,7 @@ def _capture_folders(
 
 def capture_name(folder: Path, prefix: str | None) -> str:
     """The folder's name, behind `prefix_` if there is one; InputError where that cannot be a capture's name."""
-    return safe_name(f"{prefix}_{folder.name}" if prefix else folder.name)
+    return new_name(f"{prefix}_{folder.name}" if prefix else folder.name)
 
 
 def visible(folder: Path) -> list[Path]:

@@ -1,0 +1,103 @@
+"""The rules of Windows, imposed on every system: no synced folders, no open files replaced, no names of devices."""
+
+import builtins
+import io
+import os
+import sys
+from pathlib import Path
+
+import pytest
+
+from slviewer import terminal
+from slviewer.errors import InputError
+from slviewer.session.names import new_name, safe_name
+from slviewer.session.store import Session
+
+
+@pytest.fixture
+def windows(monkeypatch):
+    """Refuse what Windows refuses: to open folders, and to move or remove what is open in this process."""
+    if not Path("/proc/self/fd").is_dir():
+        pytest.skip("open files cannot be listed here")
+    real_open = os.open
+
+    def open_file(path, flags, *rest, **options):
+        if not isinstance(path, int) and os.path.isdir(path) and not options:  # not shutil.rmtree's, of other systems
+            raise PermissionError(13, "Permission denied", str(path))
+        return real_open(path, flags, *rest, **options)
+
+    def refusing(real, replaces=False):
+        def call(source, target, **options):
+            for path in (source, target):
+                require_closed(path)
+            if os.path.exists(target) and (not replaces or os.path.isdir(target)):
+                raise FileExistsError(17, "File exists", str(target))
+            return real(source, target, **options)
+
+        return call
+
+    monkeypatch.setattr("slviewer.session.atomic._SYNCS_FOLDERS", False)
+    monkeypatch.setattr(os, "open", open_file)
+    monkeypatch.setattr(os, "rename", refusing(os.rename))
+    monkeypatch.setattr(os, "replace", refusing(os.replace, replaces=True))
+
+
+def require_closed(path) -> None:
+    """Raise PermissionError where a file at or below a path is open or mapped into memory."""
+    top = os.path.realpath(path)
+    held = {os.readlink(link) for link in map(str, Path("/proc/self/fd").iterdir()) if os.path.islink(link)}
+    maps = Path("/proc/self/maps").read_text().splitlines()
+    held |= {line.split(maxsplit=5)[5] for line in maps if "/" in line}
+    if any(name == top or name.startswith(top + os.sep) for name in held):
+        raise PermissionError(13, "The process cannot access the file because it is used", str(path))
+
+
+def test_the_simulation_refuses_to_move_what_is_open(windows, tmp_path) -> None:
+    folder = tmp_path / "a"
+    folder.mkdir()
+    with open(folder / "x", "w"), pytest.raises(PermissionError):
+        os.rename(folder, tmp_path / "b")
+    os.rename(folder, tmp_path / "b")
+
+
+def test_a_session_is_saved_and_replaced_by_the_rules_of_windows(windows, tmp_path, sequence, frames, noise) -> None:
+    with Session.create(tmp_path / "session") as session:
+        session.save_capture("part", "scan", sequence, frames, source="test")
+        assert (session.load_capture("part").stack() == frames).all()
+        session.save_capture("part", "scan", sequence, noise(2), source="test", force=True)
+        assert (session.load_capture("part").stack() == noise(2)).all()
+        session.save_rig("mine", "settle_ms = 1")
+        session.save_rig("mine", "settle_ms = 2")
+        session.trash_capture("part")
+    with Session.open(tmp_path / "session", write=True) as session:
+        assert session.capture_names() == []
+
+
+@pytest.mark.parametrize("name", ["con", "NUL", "aux.txt", "Com1", "lpt9.a.b"])
+def test_names_of_devices_are_refused_for_what_is_new(session, sequence, frames, name) -> None:
+    for save in (
+        lambda: new_name(name),
+        lambda: session.save_capture(name, "scan", sequence, frames, source="test"),
+        lambda: session.save_rig(name, ""),
+    ):
+        with pytest.raises(InputError, match=name):
+            save()
+    assert safe_name(name) == name  # what an older version saved can be read
+    assert new_name("console") == "console" and new_name("com10") == "com10"
+
+
+def test_modules_of_other_systems_are_imported_by_no_module_at_its_top() -> None:
+    missing = {"resource", "fcntl", "termios", "pwd", "grp", "pty"}
+    for path in Path(terminal.__file__).parent.rglob("*.py"):
+        for line in path.read_text("utf-8").splitlines():
+            assert not (line.startswith(("import ", "from ")) and line.split()[1] in missing), path
+
+
+def test_what_a_console_lacks_is_replaced(monkeypatch) -> None:
+    streams = [io.TextIOWrapper(io.BytesIO(), "cp1252") for _ in range(2)]
+    monkeypatch.setattr(sys, "stdout", streams[0])
+    monkeypatch.setattr(sys, "stderr", streams[1])
+    terminal.accept_all_characters()
+    for stream in streams:
+        builtins.print("±0.1 → done", file=stream, flush=True)
+        assert b"0.1" in stream.buffer.getvalue() and b"done" in stream.buffer.getvalue()
