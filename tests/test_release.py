@@ -58,7 +58,7 @@ def test_an_sdist_holds_sources_docs_tests_and_assets_and_no_caches(built) -> No
         names = {name.partition("/")[2] for name in archive.getnames()}
     wanted = "README.md LICENSE SECURITY.md CHANGELOG.md CITATION.cff pyproject.toml docs/architecture.md"
     assert {*wanted.split(), "tests/test_release.py", "assets/rigs/webcam.toml", "slviewer/py.typed"} <= names
-    assert not [name for name in names if re.search(r"__pycache__|\.venv|\.git/|_cache|^dist/|\.zarr", name)]
+    assert not [name for name in names if re.search(r"__pycache__|\.venv|\.git/|\.\w+_cache/|^dist/|\.zarr", name)]
 
 
 @pytest.mark.slow
