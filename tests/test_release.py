@@ -84,8 +84,8 @@ def test_a_wheel_works_without_the_checkout(built, tmp_path) -> None:
         return run(_python(tmp_path), "-m", "slviewer.cli", *arguments, cwd=tmp_path)
 
     assert slviewer_command("--version").split() == ["slviewer", version]
-    slviewer_command("simulate", "s", "--scale", "0.15")
-    slviewer_command("calibrate", "s", "--target", "circles:21x16:9")
+    slviewer_command("simulate", "s", "--scale", "0.15", "--poses", "6")
+    slviewer_command("calibrate", "s", "--target", "circles:21x16:9", "--models", "stereo")
     slviewer_command("reconstruct", "s", "plane_01", "--out", "plane.ply")
     slviewer_command("mesh", "s", "plane_01", "--out", "plane.stl")
     assert (tmp_path / "plane.ply").read_bytes()[:3] == b"ply" and (tmp_path / "plane.stl").stat().st_size > 10_000
