@@ -1,6 +1,6 @@
 """Sphinx configuration of the site: ``python -m sphinx -W -b html docs docs/_build``.
 
-Sphinx, as NumPy, Open3D, napari and scikit-image use it: it reads the docstrings, and checks every link between pages.
+Sphinx, as NumPy, Open3D, napari and scikit-image use it: it reads the docstrings. Links between pages are checked by a test.
 The command line's reference is written by the build, from the commands themselves. Neither building nor reading
 needs a network.
 """
@@ -79,6 +79,7 @@ def write_references(app: Sphinx) -> None:
     """Write the pages that are made from the program, where they changed."""
     for page, text in (("cli", list_options()), ("python", list_functions())):
         path = DOCS / "reference" / f"{page}.md"
+        path.parent.mkdir(exist_ok=True)
         if not path.exists() or path.read_text(encoding="utf-8") != text:
             path.write_text(text, encoding="utf-8")
 

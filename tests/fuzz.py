@@ -58,11 +58,13 @@ COMMANDS = {
         "calibrate S --target circles:21x16:9 --models stereo pixelwise", "measure S object_r1 point --at 160 120",
         "compare S object_r1 part.stl",
         "import opencv-calibration calibration.json S --force", "preflight --capture S object_r1",
+        "edit S object_r1", "region S", "plan S --out p.toml",
     ),
     "rig": ("capture S new --rig rig.toml --port 0", "preflight --rig rig.toml --port 0"),
     "frames": ("import frames images S2 --sequence frames.toml",),
     "image": ("import frames images S2 --sequence frames.toml", "detect images/00.png --target circles:21x16:9"),
     "artefact": ("accept S --artefact sphere.toml",),
+    "plan": ("inspect-parts plan.toml S --scans object_r1 --out parts",),
     "nominal": ("compare S object_r1 part.stl", "compare S object_r1 part.obj", "compare S object_r1 part_2.ply"),
     "number": (
         "capture S new --rig rig.toml --port # --exposure-ms 10", "capture S new --rig rig.toml --exposure-ms #",
@@ -76,7 +78,9 @@ COMMANDS = {
         "mesh S merge/1 --out m.stl --triangles #", "mesh S merge/1 --out m.stl --smooth #",
         "mesh S merge/1 --out m.stl --fill-holes #", "compare S object_r1 part.stl --tolerance #",
         "compare S object_r1 part.stl --reach #", "measure S object_r1 point --at # #",
-        "measure S object_r1 sphere --ball 0 0 500 #",
+        "measure S object_r1 sphere --ball 0 0 500 #", "region S --roi #,#,0,1,0,#",
+        "edit S object_r1 --polygon # 0 10 # 10 10", "edit S object_r1 --part # 120", "edit S object_r1 --undo #",
+        "plan S --out p.toml --tolerance #",
         "measure S object_r1 plane --box # 0 0 1 1 #", "simulate S2 --poses 1 --scale #", "simulate S2 --poses #x",
         "simulate S2 --poses 1 --scale 0.01 --seed #", "target circles:21x16:# --out t.pdf", "patterns --projector #x#",
         "import opencv-calibration calibration.json S --force --camera #x#",
@@ -111,6 +115,10 @@ def make_seed(folder: Path) -> None:
             "align S object_r1 object_r2",
             "measure S object_r1 point --at 160 120",
             "mesh S merge/1 --out part.stl --triangles 2000",
+            "measure S object_r1 sphere --ball 0 0 500 150",
+            "plan S --out plan.toml --tolerance 100",
+            "edit S object_r1 --polygon 0 0 3 0 0 3",
+            "region S --roi=-500,500,-500,500,100,2000",
             "export S calibration --out calibration.json --format json",
         ):
             faults.run_sound(command.split())
@@ -290,12 +298,12 @@ def _flip(data: bytes, rng: random.Random) -> bytes:
 
 def damage(folder: Path, rng: random.Random) -> tuple[str, str, str]:
     """Damage one file in a copy of the seed; returns the kind of file, what was done, and the command to run."""
-    kind = rng.choice(("session",) * 6 + ("rig", "frames", "image", "artefact", "nominal", "number"))
+    kind = rng.choice(("session",) * 6 + ("rig", "frames", "image", "artefact", "plan", "nominal", "number"))
     command = rng.choice(COMMANDS[kind])
     if kind == "number":
         numbers = (*NUMBERS, "-0", "1e308", "-1e308", "1e-320", "0.5", "9" * 5000, "1_0", "٣", "0x10", "")
         return "number", "the number", " ".join(re.sub("#", lambda _: rng.choice(numbers), w) for w in command.split())
-    names = {"rig": "rig.toml", "frames": "frames.toml", "artefact": "sphere.toml"}
+    names = {"rig": "rig.toml", "frames": "frames.toml", "artefact": "sphere.toml", "plan": "plan.toml"}
     if kind == "session":
         files = [path for path in (folder / "S").rglob("*") if path.is_file() and not path.name.startswith(".lock")]
         texts = [path for path in files if path.suffix == ".json"]
