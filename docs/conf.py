@@ -1,8 +1,8 @@
 """Sphinx configuration of the site: ``python -m sphinx -W -b html docs docs/_build``.
 
-Sphinx, as NumPy, Open3D, napari and scikit-image use it: it reads the docstrings. Links between pages are checked by a test.
-The command line's reference is written by the build, from the commands themselves. Neither building nor reading
-needs a network.
+Sphinx, as NumPy, Open3D, napari and scikit-image use it: it reads the docstrings. The command line's reference is
+written by the build, from the commands themselves. Neither building nor reading needs a network. Links between pages
+are checked by a test.
 """
 
 import contextlib

@@ -117,7 +117,7 @@ def make_seed(folder: Path) -> None:
             "mesh S merge/1 --out part.stl --triangles 2000",
             "measure S object_r1 sphere --ball 0 0 500 150",
             "plan S --out plan.toml --tolerance 100",
-            "edit S object_r1 --polygon 0 0 3 0 0 3",
+            "edit S object_r1 --polygon 160 120 190 120 160 150",
             "region S --roi=-500,500,-500,500,100,2000",
             "export S calibration --out calibration.json --format json",
         ):

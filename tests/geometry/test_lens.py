@@ -29,7 +29,11 @@ def test_project_agrees_with_opencv(lens: Lens) -> None:
 def test_undistort_agrees_with_opencv(lens: Lens) -> None:
     pixels = np.random.default_rng(2).uniform(0, [399, 299], (500, 2))
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-14)
-    theirs = cv2.undistortPoints(pixels.reshape(-1, 1, 2), K, D, criteria=criteria).reshape(-1, 2)
+    columns = pixels.reshape(-1, 1, 2)
+    if hasattr(cv2, "undistortPointsIter"):  # OpenCV 4
+        theirs = cv2.undistortPointsIter(columns, K, D, None, None, criteria).reshape(-1, 2)
+    else:
+        theirs = cv2.undistortPoints(columns, K, D, criteria=criteria).reshape(-1, 2)
     assert np.abs(lens.undistort(pixels) - theirs).max() < 1e-9
 
 
