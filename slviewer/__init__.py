@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     from slviewer.fringe.phase import PhaseMap
     from slviewer.fringe.presets import complementary, gray, micro, multifrequency, p18
     from slviewer.fringe.sequence import Frame, PatternSequence
+    from slviewer.pipeline import datasets
     from slviewer.pipeline.calibrate import CalibrationResult, calibrate, calibrate_frames, save_calibration
     from slviewer.pipeline.import_captures import import_captures, read_captures
     from slviewer.pipeline.measure import measure
@@ -82,6 +83,7 @@ _EXPORTS = {
     "calibrate_frames": "pipeline.calibrate",
     "check_description": "fringe.description_check",
     "complementary": "fringe.presets",
+    "datasets": "pipeline.datasets:*",
     "decode": "fringe.decode",
     "detect_board": "target.detect:detect",
     "draw_error_maps": "report.maps:error_maps",
@@ -106,12 +108,12 @@ _EXPORTS = {
     "verify": "pipeline.verify",
     "write_ply": "session.ply",
 }
-"""{public name: module}, or module:name where it has another name there."""
+"""{public name: module}, or module:name where it has another name there, or module:* for the module itself."""
 
 __all__ = [
     "Board", "CalibrationResult", "Cloud", "Frame", "PatternSequence", "PhaseMap", "Session", "SlviewerError",
-    "align_clouds", "calibrate", "calibrate_frames", "check_description", "complementary", "decode", "detect_board",
-    "draw_error_maps", "evaluate_plane", "evaluate_sphere", "fuse_clouds", "gray", "import_captures",
+    "align_clouds", "calibrate", "calibrate_frames", "check_description", "complementary", "datasets", "decode",
+    "detect_board", "draw_error_maps", "evaluate_plane", "evaluate_sphere", "fuse_clouds", "gray", "import_captures",
     "load_calibration", "measure", "merge", "mesh", "mesh_cloud", "micro", "multifrequency", "p18", "read_captures",
     "reconstruct", "reconstruct_cloud", "save_calibration", "texture", "verify", "write_ply",
 ]  # fmt: skip
@@ -121,7 +123,8 @@ def __getattr__(name: str) -> Any:
     if name not in _EXPORTS:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     module, _, original = _EXPORTS[name].partition(":")
-    return getattr(import_module(f"{__name__}.{module}"), original or name)
+    imported = import_module(f"{__name__}.{module}")
+    return imported if original == "*" else getattr(imported, original or name)
 
 
 def __dir__() -> list[str]:

@@ -40,6 +40,11 @@ def describe_simulation(names: list[str], session: Path, **_: Any) -> str:
     return f"{len(names)} captures simulated into {session}; next: slviewer calibrate {session} --target {TARGET}"
 
 
+def describe_dataset(folder: Path, **_: Any) -> str:
+    """Describe where a data set is."""
+    return f"images in {folder}"
+
+
 DESCRIPTION = "Structured-light 3D scanning: calibrate a camera and a projector, prove it, scan, merge."
 
 
@@ -124,6 +129,13 @@ COMMANDS = Commands(
         "batch": partial(read_command, "pipeline.batch:batch", "sessions", options=[JSON]),
         "check": partial(read_command, "pipeline.check:check", "session", "capture", options=[JSON]),
         "accept": partial(read_command, "pipeline.accept:accept", "session", options=[JSON]),
+        "fetch": partial(
+            read_command,
+            "pipeline.datasets:fetch",
+            "name",
+            "folder",
+            run=partial(show_result, describe=describe_dataset),
+        ),
         "simulate": partial(
             read_command,
             "pipeline.simulate:simulate",
