@@ -40,9 +40,9 @@ def describe_simulation(names: list[str], session: Path, **_: Any) -> str:
     return f"{len(names)} captures simulated into {session}; next: slviewer calibrate {session} --target {TARGET}"
 
 
-def describe_dataset(folder: Path, **_: Any) -> str:
+def describe_dataset(fetched: Path, **_: Any) -> str:
     """Describe where a data set is."""
-    return f"images in {folder}"
+    return f"images in {fetched}"
 
 
 DESCRIPTION = "Structured-light 3D scanning: calibrate a camera and a projector, prove it, scan, merge."

@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 import slviewer as sl
+from slviewer.cli import main
 from slviewer.pipeline import datasets
 
 
@@ -32,3 +33,8 @@ def test_an_unknown_name_and_a_wrong_hash_are_refused(tmp_path: Path, monkeypatc
     with pytest.raises(sl.SlviewerError, match="hash"):
         sl.datasets.fetch("sample", tmp_path / "new")
     assert not (tmp_path / "new").exists()
+
+
+def test_the_command_prints_the_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["fetch", "sample", str(tmp_path / "new")]) == 0
+    assert str(tmp_path / "new") in capsys.readouterr().out
