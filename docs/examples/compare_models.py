@@ -1,0 +1,23 @@
+"""Compare the stereo and the pixelwise model on a plane, as two error maps: compare_models.py PICTURE."""
+
+import sys
+from pathlib import Path
+
+import slviewer as sl
+
+folder = sl.datasets.fetch("sample")
+poses = sl.read_captures(folder / "poses")
+frames = {pose.name: pose.frames for pose in poses}
+calibration = sl.calibrate_frames(poses[0].sequence, frames, "circles:21x16:9", models=["stereo", "pixelwise"])
+(scan,) = sl.read_captures(folder / "scan")
+phases = {axis: sl.decode(scan.sequence, scan.frames, axis) for axis in scan.sequence.axes}
+planes = {}
+assert calibration.pixelwise
+for name, model in {"stereo": calibration.stereo, "pixelwise": calibration.pixelwise}.items():
+    cloud = sl.reconstruct_cloud(model, phases)
+    planes[name] = sl.evaluate_plane(cloud.points, None, cloud.sigma_z)
+    print(f"{name}: RMS {planes[name].rms_mm:.3f} mm, noise floor {planes[name].noise_floor_mm:.3f} mm")
+maps = {name: plane.error_map for name, plane in planes.items()}
+rms = {name: plane.rms_mm for name, plane in planes.items()}
+drawing = sl.draw_error_maps("Plane", maps, rms, planes["stereo"].noise_floor_mm)
+Path(sys.argv[1]).write_bytes(drawing.png)
