@@ -11,10 +11,13 @@ frames = {pose.name: pose.frames for pose in poses}
 calibration = sl.calibrate_frames(poses[0].sequence, frames, "circles:21x16:9", models=["stereo", "pixelwise"])
 (scan,) = sl.read_captures(folder / "scan")
 phases = {axis: sl.decode(scan.sequence, scan.frames, axis) for axis in scan.sequence.axes}
-planes = {}
 assert calibration.pixelwise
-for name, model in {"stereo": calibration.stereo, "pixelwise": calibration.pixelwise}.items():
-    cloud = sl.reconstruct_cloud(model, phases)
+clouds = {
+    "stereo": sl.reconstruct_cloud(calibration.stereo, phases),
+    "pixelwise": sl.reconstruct_cloud(calibration.pixelwise, phases),
+}
+planes = {}
+for name, cloud in clouds.items():
     planes[name] = sl.evaluate_plane(cloud.points, None, cloud.sigma_z)
     print(f"{name}: RMS {planes[name].rms_mm:.3f} mm, noise floor {planes[name].noise_floor_mm:.3f} mm")
 maps = {name: plane.error_map for name, plane in planes.items()}
