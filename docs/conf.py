@@ -6,6 +6,7 @@ are checked by a test.
 """
 
 import contextlib
+import inspect
 import io
 import os
 import re
@@ -70,8 +71,11 @@ def list_functions() -> str:
     """Return the page of the Python interface: every public name of slviewer with its docstring."""
     lines = ["# Python", "", "```{eval-rst}", ".. automodule:: slviewer", ""]
     for name in slviewer.__all__:
-        kind = "autoclass" if isinstance(getattr(slviewer, name), type) else "autofunction"
-        lines += [f".. {kind}:: slviewer.{name}", ""]
+        public = getattr(slviewer, name)
+        if inspect.ismodule(public):
+            lines += [f".. automodule:: {public.__name__}", "   :members:", ""]
+            continue
+        lines += [f".. {'autoclass' if isinstance(public, type) else 'autofunction'}:: slviewer.{name}", ""]
     return "\n".join([*lines, "```", ""])
 
 

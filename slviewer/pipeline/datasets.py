@@ -61,7 +61,11 @@ def fetch(name: str = "sample", folder: Path | str | None = None) -> Path:
     target.parent.mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory(dir=target.parent, prefix=".fetch-") as scratch, source.open("rb") as archive:
         unpacked, _ = unpack(archive, Path(scratch), lambda done: None)
-        unpacked.rename(target)
+        try:
+            unpacked.rename(target)
+        except OSError:
+            if folder is not None or not target.is_dir():  # else another process was faster
+                raise
     return target
 
 
