@@ -1,5 +1,6 @@
 """Projector light and ambient light: exposure, response to grey levels, ambient light, flicker."""
 
+import time
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,7 +10,9 @@ from slviewer.pipeline.check_results import Check, CheckVerdict
 from slviewer.pipeline.exposure_check import CLIPPED, MUCH_CLIPPED, TOO_WEAK, WEAK
 from slviewer.preflight.rig_under_test import RigUnderTest
 
-_WHITE, _DARK = 24, 12
+_WHITE, _DARK = 24, 24
+_SPREAD_S = 0.01  # one period of 100 Hz, over which images begin: at an even pace they may all see one phase
+_GOLDEN = 0.618034
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +36,11 @@ def _grab_images(bench: RigUnderTest, grey: int | None, count: int) -> tuple[np.
     """Start times (n,) s and images (n, h, w) of ``count`` images under even light."""
     bench.show(grey, "steadiness of the light")
     bench.wait()
-    begin_s, images = zip(*(bench.grab_timed() for _ in range(count)), strict=True)
+    timed = []
+    for k in range(count):
+        time.sleep(_SPREAD_S * (k * _GOLDEN % 1))
+        timed.append(bench.grab_timed())
+    begin_s, images = zip(*timed, strict=True)
     return np.array(begin_s), np.stack(images)
 
 
