@@ -7,7 +7,7 @@ import cv2
 import msgspec
 import numpy as np
 from playwright.sync_api import Browser, expect
-from wizard_page import button, choose
+from wizard_page import choose, click
 
 from slviewer.devices.browser import PageChannels
 from slviewer.devices.browser_camera import Video
@@ -68,14 +68,14 @@ def test_the_operator_sees_what_the_camera_page_needs(browser: Browser) -> None:
         page = browser.new_page()
         try:
             page.goto(app.server.link())
-            button(page, "1. Rig").click()
+            click(page, "1. Rig")
             choose(page, "Rig", "Custom …")
             choose(page, "Camera", "browser: a page on a screen, phone or laptop")
             expect(page.get_by_text("Camera page: waiting for the page")).to_be_visible()
             hello = {"op": "hello", "window": "a", "take": False, "video": VIDEO}
             pages.camera.connect(msgspec.json.encode(hello), lambda _: None)
             expect(page.get_by_text("Camera page: ready 1920 x 1080")).to_be_visible()
-            button(page, "Use these devices").click()
+            click(page, "Use these devices")
             expect(page.get_by_text("the projector's size is unknown").first).to_be_visible()
         finally:
             page.close()

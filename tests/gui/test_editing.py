@@ -11,7 +11,7 @@ import pytest
 import trimesh
 from playwright.sync_api import Browser, Page, expect
 from scipy.spatial import cKDTree
-from wizard_page import SIZE, Opened, button, choose, cut_labels, field
+from wizard_page import SIZE, Opened, button, choose, click, cut_labels, field
 
 from slviewer.devices.simulated import simulated_rig
 from slviewer.devices.world import SimulatedWorld
@@ -54,7 +54,7 @@ def wizard(tmp_path: Path, browser: Browser) -> Iterator[tuple[Opened, App, Oper
         page.set_default_timeout(20_000)
         opened = Opened(page)
         page.goto(app.server.link())
-        button(page, "6. Scan").click()
+        click(page, "6. Scan")
         expect(page.get_by_text(re.compile("points shown; the file has all"))).to_be_visible(timeout=PATIENCE_S * 1000)
         yield opened, app, operator
         page.close()
@@ -102,11 +102,11 @@ def test_points_are_selected_deleted_and_brought_back(wizard: tuple[Opened, App,
     for dx, dy in ((-30, -30), (30, -30), (30, 30), (-30, 30)):
         page.mouse.click(x + dx, y + dy)
         page.wait_for_timeout(400)
-    button(page, "Close outline").click()
+    click(page, "Close outline")
     wait_until(page, lambda: count_selected(page) > 0)
     selected = count_selected(page)
     assert 20 < selected < 0.5 * len(valid)
-    button(page, "Delete selected").click()
+    click(page, "Delete selected")
     wait_until(page, lambda: len(operator.snapshot().scan("one").edits) == 1)  # type: ignore[union-attr]
     (edit,) = load_edits(operator.session, "one").active
     assert edit.pixels is not None and edit.pixels[v, u] and edit.points == selected
@@ -121,17 +121,17 @@ def test_points_are_selected_deleted_and_brought_back(wizard: tuple[Opened, App,
     page.mouse.move(x + 60, y + 60, steps=4)
     page.mouse.up()
     wait_until(page, lambda: count_selected(page) > 0)
-    button(page, "Invert selection").click()
+    click(page, "Invert selection")
     total = len(valid) - selected
     wait_until(page, lambda: count_selected(page) > 0.3 * total)
-    button(page, "Hide selected").click()
+    click(page, "Hide selected")
     expect(page.get_by_text(re.compile(r"[\d,]+ hidden"))).to_be_visible()
     assert len(operator.snapshot().scan("one").edits) == 1  # type: ignore[union-attr]
-    button(page, "Show hidden").click()
-    button(page, "Undo edit").click()
+    click(page, "Show hidden")
+    click(page, "Undo edit")
     wait_until(page, lambda: not operator.snapshot().scan("one").edits)  # type: ignore[union-attr]
     expect(page.get_by_text(re.compile("points shown; the file has all"))).to_be_visible()
-    button(page, "Redo edit").click()
+    click(page, "Redo edit")
     wait_until(page, lambda: len(operator.snapshot().scan("one").edits) == 1)  # type: ignore[union-attr]
     assert cut_labels(page) == []
     assert opened.errors == []
@@ -146,7 +146,7 @@ def test_points_of_two_scans_are_deleted_and_brought_back_in_the_step_merge(
     operator.wait_until_idle()
     assert operator.session is not None
     points = whole_cloud(operator.session, "one").points
-    button(page, "7. Merge").click()
+    click(page, "7. Merge")
     expect(button(page, "Merge 2 scans")).to_be_visible()
     unfold(page, "Edit points")
     choose(page, "Select by", "lasso")
@@ -157,19 +157,19 @@ def test_points_of_two_scans_are_deleted_and_brought_back_in_the_step_merge(
     for dx, dy in ((-30, -30), (30, -30), (30, 30), (-30, 30)):
         page.mouse.click(x + dx, y + dy)
         page.wait_for_timeout(400)
-    button(page, "Close outline").click()
+    click(page, "Close outline")
     wait_until(page, lambda: count_selected(page) > 0)
     selected = count_selected(page)
 
     def edits() -> list[int]:
         return [len(operator.snapshot().scan(name).edits) for name in ("one", "two")]  # type: ignore[union-attr]
 
-    button(page, "Delete selected").click()
+    click(page, "Delete selected")
     wait_until(page, lambda: edits() == [1, 1])
     assert sum(load_edits(operator.session, name).active[0].points for name in ("one", "two")) == selected
-    button(page, "Undo edit").click()
+    click(page, "Undo edit")
     wait_until(page, lambda: edits() == [0, 0])
-    button(page, "Redo edit").click()
+    click(page, "Redo edit")
     wait_until(page, lambda: edits() == [1, 1])
     assert cut_labels(page) == []
     assert opened.errors == []
@@ -187,7 +187,7 @@ def test_the_region_is_placed_by_numbers_and_by_its_handle(wizard: tuple[Opened,
         return session.region if session.region_is_on else None
 
     unfold(page, "Region of interest")
-    button(page, "Automatic region").click()
+    click(page, "Automatic region")
     wait_until(page, lambda: region() is not None)
     automatic = region()
     assert scan_cloud(operator.session, "one").measured_count > 0.995 * total
@@ -234,7 +234,7 @@ def test_six_clicks_make_a_clean_textured_mesh_of_a_part_on_a_table(tmp_path: Pa
         page.set_default_timeout(20_000)
         opened = Opened(page)
         page.goto(app.server.link())
-        button(page, "6. Scan").click()
+        click(page, "6. Scan")
         for name in names:  # as a capture does with "Align as you scan"
             operator.reconstruct(name)
             operator.wait_until_idle()
@@ -243,13 +243,13 @@ def test_six_clicks_make_a_clean_textured_mesh_of_a_part_on_a_table(tmp_path: Pa
         expect(page.get_by_text("seen by more than one; gaps")).to_be_visible(timeout=PATIENCE_S * 1000)
         page.evaluate("window.clicks = 0; addEventListener('click', () => window.clicks++, true)")
 
-        button(page, "Remove support, 3 scans").click()
+        click(page, "Remove support, 3 scans")
         wait_until(page, lambda: all(operator.snapshot().scan(name).edits for name in names))  # type: ignore[union-attr]
-        button(page, "7. Merge").click()
-        button(page, "Merge 3 scans").click()
+        click(page, "7. Merge")
+        click(page, "Merge 3 scans")
         wait_until(page, lambda: operator.snapshot().session.merge is not None)  # type: ignore[union-attr]
-        button(page, "9. Export").click()
-        button(page, "Write textured mesh").click()
+        click(page, "9. Export")
+        click(page, "Write textured mesh")
         link = page.get_by_role("link", name=re.compile(r"Download .*\.glb"))
         expect(link).to_be_visible(timeout=3 * PATIENCE_S * 1000)
         with page.expect_download() as started:
@@ -286,7 +286,7 @@ def test_a_plan_is_made_uploaded_and_run_on_two_scans(tmp_path: Path, browser: B
         page.set_default_timeout(20_000)
         opened = Opened(page)
         page.goto(app.server.link())
-        button(page, "8. Measure").click()
+        click(page, "8. Measure")
         page.wait_for_timeout(2500)  # the view moves to the surface
         page.get_by_text("Sphere", exact=True).click()
         choose(page, "Region", "rectangle")
@@ -298,17 +298,17 @@ def test_a_plan_is_made_uploaded_and_run_on_two_scans(tmp_path: Path, browser: B
         page.mouse.move(x + 50, y + 50, steps=4)
         page.mouse.up()
         expect(page.get_by_text(re.compile(r"[\d,]+ points in the box"))).to_be_visible()
-        button(page, "Fit sphere").click()
+        click(page, "Fit sphere")
         wait_until(page, lambda: len(operator.snapshot().session.measurements) == 1)  # type: ignore[union-attr]
         (fitted,) = operator.snapshot().session.measurements  # type: ignore[union-attr]
         radius = fitted.data["quantities"][0]
         assert abs(radius["value"] - 98.0) < 1.5 and "box" in fitted.data["where"]
-        button(page, "End tool").click()
-        button(page, "Make plan").click()
+        click(page, "End tool")
+        click(page, "Make plan")
         wait_until(page, lambda: operator.snapshot().session.plans == (OWN_PLAN,))  # type: ignore[union-attr]
         unfold(page, "Inspection plan")
         choose(page, "Parts", "all 2 scans")
-        button(page, "Run plan").click()
+        click(page, "Run plan")
 
         def decisions() -> list[str]:
             seen = operator.snapshot().session.inspection  # type: ignore[union-attr]
@@ -325,11 +325,11 @@ def test_a_plan_is_made_uploaded_and_run_on_two_scans(tmp_path: Path, browser: B
         write_plan(replace(plan, name="small", characteristic=wide), tmp_path / "small.toml")
         for count, (name, judged) in enumerate((("ball", "2 pass"), ("small", "2 fail")), 2):
             with page.expect_file_chooser() as chooser:
-                button(page, "Upload plan").click()
+                click(page, "Upload plan")
             chooser.value.set_files(tmp_path / f"{name}.toml")
             wait_until(page, lambda count=count: len(operator.snapshot().session.plans) == count)  # type: ignore[misc,union-attr]
             choose(page, "Plan", f"{name}.toml")
-            button(page, "Run plan").click()
+            click(page, "Run plan")
             expect(page.get_by_text(judged, exact=True)).to_be_visible(timeout=PATIENCE_S * 1000)
         assert "small" in (folder / "exports" / "parts.html").read_text()
         assert cut_labels(page) == []

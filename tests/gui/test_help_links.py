@@ -5,7 +5,7 @@ import re
 from pathlib import Path
 
 from playwright.sync_api import Browser, Locator, Page, expect
-from wizard_page import SIZE, Opened, button
+from wizard_page import SIZE, Opened, click
 
 from slviewer import wizard
 from slviewer.calibration.diagnosis.verdict import CAUSES, Finding, Verdict
@@ -87,10 +87,10 @@ def test_help_opens_beside_the_wizard(opened: Opened, app: App, operator: Operat
         return shown.value
 
     step_help = page.get_by_role("link", name="Help").first
-    button(page, "1. Rig").click()
+    click(page, "1. Rig")
     expect(step_help).to_have_attribute("href", "help/howto/wizard.md#rig")
     follow(step_help, "Rig").close()
-    button(page, "2. Target").click()
+    click(page, "2. Target")
     expect(step_help).to_have_attribute("href", "help/howto/wizard.md#target")
     tab = follow(step_help, "Target")
 
@@ -103,7 +103,7 @@ def test_help_opens_beside_the_wizard(opened: Opened, app: App, operator: Operat
 
     save_verdict(operator.session, Verdict.of([Finding("moved", "rejected", "pose_03 moved", "hold it still")]), ())
     operator.choose_target("circles:21x16:9")
-    button(page, "4. Calibrate").click()
+    click(page, "4. Calibrate")
     finding = page.locator("a[href$='#moved']")
     follow(finding, "Moved").close()
 

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 from playwright.sync_api import expect
-from wizard_page import PATIENCE_MS, Opened, button, choose, field
+from wizard_page import PATIENCE_MS, Opened, button, choose, click, field
 
 from slviewer.fringe.patterns import render
 from slviewer.fringe.presets import gray
@@ -41,7 +41,7 @@ def zip_of_captures() -> bytes:
 
 def test_an_uploaded_zip_becomes_poses(opened: Opened, operator: Operator) -> None:
     page = opened.page
-    button(page, "3. Poses").click()
+    click(page, "3. Poses")
     page.get_by_text("Import captures", exact=True).click()
     choose(page, "Layout", "procam-calibration")
     expect(page.get_by_text("Default size: 1024x768, of this layout.")).to_be_visible()
@@ -49,7 +49,7 @@ def test_an_uploaded_zip_becomes_poses(opened: Opened, operator: Operator) -> No
     page.wait_for_timeout(1200)  # an input is entered once nobody types
     for name, content in (("broken.zip", b"no zip"), ("set.zip", zip_of_captures())):
         with page.expect_file_chooser() as chooser:
-            button(page, "Upload zip").click()
+            click(page, "Upload zip")
         chooser.value.set_files({"name": name, "mimeType": "application/zip", "buffer": content})
         if name == "broken.zip":
             expect(page.get_by_text(re.compile("the file is no zip")).first).to_be_visible()

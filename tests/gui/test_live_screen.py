@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from playwright.sync_api import Browser, expect
-from wizard_page import SIZE, Opened, button
+from wizard_page import SIZE, Opened, click
 
 from slviewer.fringe.layout import to_eight_bits
 from slviewer.gui.app import App
@@ -41,11 +41,11 @@ def test_live_clouds_are_seen_kept_and_ended(browser: Browser, app: App) -> None
     page = browser.new_page(viewport=SIZE)
     found = Opened(page)
     page.goto(app.server.link())
-    button(page, "6. Scan").click()
-    button(page, "Live").click()
+    click(page, "6. Scan")
+    click(page, "Live")
     expect(page.get_by_text("clouds/s").first).to_be_visible(timeout=COMPILED_MS)
     expect(page.get_by_text("Nothing is saved yet")).to_be_visible()
-    button(page, "Save cloud").click()
+    click(page, "Save cloud")
     expect(page.get_by_text("scan_01").first).to_be_visible()
     assert app.operator.wait_for(lambda s: s.live is not None and s.live.shown_per_s > 0, COMPILED_MS / 1000)
     app.shell.go("merge")  # to leave the step ends it

@@ -14,7 +14,7 @@ import pytest
 import trimesh
 from playwright.sync_api import Browser, Page, expect
 from playwright.sync_api import TimeoutError as NotShownError
-from wizard_page import SIZE, Opened, button, cut_labels, field
+from wizard_page import SIZE, Opened, button, click, cut_labels, field
 
 from slviewer.calibration.diagnosis.verdict import Finding, Verdict
 from slviewer.evaluation.crossvalidation import CrossValidation, HeldOutPose
@@ -70,7 +70,7 @@ def choose(page: Page, label: str, option: str) -> None:
 
 def test_a_calibration_shows_its_poses_and_what_a_pixel_learnt(measured: tuple[Page, Operator, list[str]]) -> None:
     page, _, errors = measured
-    button(page, "4. Calibrate").click()
+    click(page, "4. Calibrate")
     expect(page.get_by_text("Reprojection RMS, camera")).to_be_visible()
     expect(page.get_by_text("Reprojection error of each target pose.")).to_be_visible()
     choose(page, "Pose", "pose_02")
@@ -84,10 +84,10 @@ def test_a_calibration_shows_its_poses_and_what_a_pixel_learnt(measured: tuple[P
     field(page, "Pixel v").fill("0")
     expect(page.get_by_text("Pixel (150, 0) saw the board in too few poses")).to_be_visible()
 
-    button(page, "Exclude pose_02").click()
+    click(page, "Exclude pose_02")
     expect(button(page, "Include pose_02 again")).to_be_visible()
     expect(page.get_by_text("Excluded since").first).to_be_visible()
-    button(page, "Include pose_02 again").click()
+    click(page, "Include pose_02 again")
     expect(button(page, "Exclude pose_02")).to_be_visible()
     page.get_by_text("Parameters", exact=True).click()
     expect(page.get_by_text("angle between the optical axes")).to_be_visible()
@@ -98,8 +98,8 @@ def test_models_are_compared_on_request_and_the_comparison_can_be_cancelled(
     measured: tuple[Page, Operator, list[str]],
 ) -> None:
     page, engine, errors = measured
-    button(page, "4. Calibrate").click()
-    button(page, "Compare models").click()
+    click(page, "4. Calibrate")
+    click(page, "Compare models")
     again = button(page, "Compare again")
     expect(again).to_be_enabled(timeout=90_000)
     expect(page.get_by_text("pixelwise is recommended").first).to_be_visible()
@@ -120,15 +120,15 @@ def test_models_are_compared_on_request_and_the_comparison_can_be_cancelled(
 
 def test_a_plane_is_measured_and_its_table_written(measured: tuple[Page, Operator, list[str]]) -> None:
     page, _, errors = measured
-    button(page, "5. Verify").click()
+    click(page, "5. Verify")
     choose(page, "Capture", "plane_03")
-    button(page, "Measure plane").click()
+    click(page, "Measure plane")
     expect(page.get_by_text("errors on one colour scale, red is towards the camera")).to_be_visible(timeout=40_000)
     choose(page, "Capture", "sphere_3")
-    button(page, "Measure sphere").click()
+    click(page, "Measure sphere")
     expect(page.get_by_text("errors on one colour scale, red is outwards")).to_be_visible(timeout=40_000)
     expect(page.get_by_text("error of pixelwise; red is outwards")).to_be_visible()
-    button(page, "Write CSV").click()
+    click(page, "Write CSV")
     with page.expect_download() as download:
         page.get_by_text("Download verifications.csv").click()
     lines = Path(download.value.path()).read_text().splitlines()
@@ -157,30 +157,30 @@ def test_scans_are_reconstructed_asked_merged_and_exported(
     measured: tuple[Page, Operator, list[str]], tmp_path: Path
 ) -> None:
     page, operator, errors = measured
-    button(page, "6. Scan").click()
+    click(page, "6. Scan")
     for name in ("object_r1", "object_r2"):
         choose(page, "Scan", name)
-        button(page, "Reconstruct").click()
+        click(page, "Reconstruct")
         assert operator.wait_for(lambda s, name=name: s.scan(name).cloud == "fresh", 40.0)  # type: ignore[misc]
     expect(page.get_by_text(re.compile("points shown; the file has all"))).to_be_visible()
-    button(page, "Zoom to fit").click()
+    click(page, "Zoom to fit")
     choose(page, "Colour", "depth")
     expect(page.get_by_text(re.compile(r"^\d+\.\d\smm$")).first).to_be_visible()
     click_until(page, (590, 420), "Phase, axis x")  # right of where notifications stand
     field(page, "New name").fill("Lion <b>1</b>")
-    button(page, "Rename scan").click()
+    click(page, "Rename scan")
     expect(page.get_by_text("Lion <b>1</b> (object_r2)").first).to_be_visible()
 
-    button(page, "7. Merge").click()
+    click(page, "7. Merge")
     choose(page, "Start from", "turntable")
     expect(page.get_by_text(re.compile(r"object_r1 at 0°, Lion <b>1</b> at 30°"))).to_be_visible()
     choose(page, "Start from", "current position")
-    button(page, "Merge 2 scans").click()
+    click(page, "Merge 2 scans")
     expect(page.get_by_text("Not merged.")).to_be_visible(timeout=60_000)
     expect(page.get_by_text("Or use the initial alignment by features, or by picked points.").first).to_be_visible()
     pick_two_places(page)
     choose(page, "Start from", "features")
-    button(page, "Merge 2 scans").click()
+    click(page, "Merge 2 scans")
     expect(page.get_by_text(re.compile("in the frame of"))).to_be_visible(timeout=60_000)
     expect(page.get_by_text(re.compile(r"^0\.0\d+\smm")).first).to_be_visible()
     expect(page.get_by_text("Not merged.")).to_be_hidden()
@@ -204,7 +204,7 @@ def test_scans_are_reconstructed_asked_merged_and_exported(
     field(page, "Triangles").fill("6000")
     field(page, "Triangles").press("Tab")
     expect(page.get_by_text(re.compile(r"Unit: metres.*About \d+\skB"))).to_be_visible()
-    button(page, "Write file").click()
+    click(page, "Write file")
     with page.expect_download() as download:
         page.get_by_role("link", name="Download object_r2_mesh.glb").click(timeout=40_000)
     download.value.save_as(tmp_path / "part.glb")
@@ -214,7 +214,7 @@ def test_scans_are_reconstructed_asked_merged_and_exported(
         page.get_by_text(re.compile(r"^object_r2: (5\d{3}|6000) triangles by grid.*smoothing moved the surface by"))
     ).to_be_visible()
     choose(page, "Texture", "1024 px")
-    button(page, "Write again").click()
+    click(page, "Write again")
     expect(page.get_by_text(re.compile("texture of 1024x1024 px"))).to_be_visible(timeout=120_000)
     assert operator.wait_until_idle() is not None
     with page.expect_download() as download:
@@ -222,18 +222,18 @@ def test_scans_are_reconstructed_asked_merged_and_exported(
     download.value.save_as(tmp_path / "textured.glb")
     part = trimesh.load(tmp_path / "textured.glb", force="mesh")
     assert np.asarray(part.visual.material.baseColorTexture).shape[:2] == (1024, 1024)
-    button(page, "Write calibration").click()
+    click(page, "Write calibration")
     expect(page.get_by_text("calibration.yml").first).to_be_visible()
     choose(page, "Content", "poses")
     choose(page, "Format", "JSON")
-    button(page, "Write poses").click()
+    click(page, "Write poses")
     with page.expect_download() as download:
         page.get_by_role("link", name="Download poses.json").click(timeout=40_000)
     poses = json.loads(Path(download.value.path()).read_text())
     assert len(poses["targets"]) == 8 and len(poses["merges"][0]["scans"]) == 2
 
-    button(page, "7. Merge").click()
-    button(page, "Undo merge").click()
+    click(page, "7. Merge")
+    click(page, "Undo merge")
     expect(button(page, "Undo merge")).to_be_hidden()
     assert errors == []
 
@@ -246,7 +246,7 @@ def test_a_part_is_measured_and_compared_with_its_nominal(
         if operator.wait_until_idle().scan(name).cloud != "fresh":  # type: ignore[union-attr]
             assert operator.reconstruct(name)
     operator.wait_until_idle(60)
-    button(page, "8. Measure").click()
+    click(page, "8. Measure")
     choose(page, "Surface", next(t for t in ("Lion <b>1</b> (object_r2)", "object_r2") if titles(operator, t)))
     tool(page, "Distance", "Click the first point.")
     click_until(page, (480, 440), "Click the second point.")
@@ -269,7 +269,7 @@ def test_a_part_is_measured_and_compared_with_its_nominal(
     choose(page, "Surface", "sphere_3")
     tool(page, "Sphere", "Click the centre of the sphere.")
     click_until(page, (540, 400), "points in the ball")
-    button(page, "Fit sphere").click()
+    click(page, "Fit sphere")
     radius = quantities_of(came(operator, 3))[0]
     assert radius.U is not None and abs(radius.value - 98.0) < max(2 * radius.U, 0.1)  # the simulated sphere's, mm
     field(page, "New name").fill("Ball <i>")
@@ -279,22 +279,22 @@ def test_a_part_is_measured_and_compared_with_its_nominal(
     tool(page, "Deviation", "Choose or upload a nominal model")
     choose(page, "Surface", next(t for t in ("Lion <b>1</b> (object_r2)", "object_r2") if titles(operator, t)))
     with page.expect_file_chooser() as chooser:
-        button(page, "Upload model").click()
+        click(page, "Upload model")
     chooser.value.set_files(asset("objects/ammonite.ply"))
     field(page, "Tolerance ±, mm").fill("1.5")
     expect(button(page, "Compare")).to_be_enabled()
-    button(page, "Compare").click()
+    click(page, "Compare")
     found = came(operator, 4).data
     assert found["verdict"]["decision"] == "pass" and 0.01 < found["statistics_mm"]["rms"] < 0.5
     expect(page.get_by_text("Tolerance ± 1.5 mm: pass").first).to_be_visible()
     expect(page.get_by_text("Histogram of the deviations.")).to_be_visible()
 
-    button(page, "Delete result").click()
-    button(page, "Restore deleted").click()
+    click(page, "Delete result")
+    click(page, "Restore deleted")
     expect(button(page, "Restore deleted")).to_be_hidden()
     came(operator, 4)
     operator.wait_until_idle(60)
-    button(page, "Write CSV").click()
+    click(page, "Write CSV")
     with page.expect_download() as download:
         page.get_by_text("Download measurements.csv").click(timeout=40_000)
     rows = list(csv.DictReader(Path(download.value.path()).read_text("utf-8-sig").splitlines()))
@@ -339,7 +339,7 @@ def test_a_rejected_calibration_says_why_and_is_used_only_where_one_insists(
     page, operator, errors = measured
     store = operator.session
     assert store is not None
-    button(page, "4. Calibrate").click()
+    click(page, "4. Calibrate")
     expect(page.get_by_text("no problems detected")).to_be_visible()
     choose(page, "Model", "stereo")
     expect(page.get_by_text("stereo is used (your choice); pixelwise is recommended")).to_be_visible()
@@ -350,11 +350,11 @@ def test_a_rejected_calibration_says_why_and_is_used_only_where_one_insists(
     assert operator.choose_model("")
     expect(page.get_by_text("do not measure with it")).to_be_visible()
     expect(page.get_by_text("Hold the <b>board</b> still.")).to_be_visible()
-    button(page, "pose_03").click()
+    click(page, "pose_03")
     expect(page.get_by_text(re.compile("pose_03, .*: measured minus predicted features"))).to_be_visible()
-    button(page, "6. Scan").click()
+    click(page, "6. Scan")
     expect(page.get_by_text("The calibration was rejected: pose_03 moved by 0.9 px").first).to_be_visible()
-    button(page, "4. Calibrate").click()
+    click(page, "4. Calibrate")
     page.get_by_label("Accept anyway").check()
     assert operator.wait_for(lambda s: s.step("scan").state != "blocked", 10.0)
     assert errors == []
@@ -364,7 +364,7 @@ def test_no_label_is_cut_at_1280_by_800(measured: tuple[Page, Operator, list[str
     page, operator, _ = measured
     assert page.viewport_size == SIZE
     for number, step in enumerate(operator.snapshot().steps, 1):
-        button(page, f"{number}. {step.title}").click()
+        click(page, f"{number}. {step.title}")
         page.wait_for_timeout(1000)  # the panel is drawn, and what it computes may replace its instruction
         assert cut_labels(page) == [], step.title
 

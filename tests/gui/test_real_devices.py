@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from playwright.sync_api import Browser, Page, expect
-from wizard_page import SIZE, Opened, button, choose, field
+from wizard_page import SIZE, Opened, choose, click, field
 
 from slviewer.devices.browser import PageChannels
 from slviewer.fringe.decode import decode
@@ -54,7 +54,7 @@ def test_a_network_camera_and_a_browser_capture_what_is_projected(browser: Brows
         opened = Opened(page)
         try:
             page.goto(app.server.link())
-            button(page, "1. Rig").click()
+            click(page, "1. Rig")
             choose(page, "Rig", "Custom …")
             expect(page.get_by_text("Projector page: waiting for the page")).to_be_visible()
             content = page.content()  # whoever only watches reads this too
@@ -64,7 +64,7 @@ def test_a_network_camera_and_a_browser_capture_what_is_projected(browser: Brows
             expect(page.get_by_text("Projector page: ready 320 x 240")).to_be_visible()
             field(page, "Camera ID").fill(camera.url)
             page.wait_for_timeout(500)
-            button(page, "Use these devices").click()
+            click(page, "Use these devices")
             watch(operator, projector, camera, "open rig", lambda s: s.rig.state == "open")
             expect(page.get_by_text(re.compile(r"camera 320\s×\s240\spx, projector 320\s×\s240\spx"))).to_be_visible()
             expect(page.get_by_text("its settings are its own").or_(page.get_by_text("settings")).first).to_be_visible()
@@ -109,7 +109,7 @@ def test_a_rig_that_is_refused_leaves_the_one_in_use(opened: Opened, operator: O
     camera = {"driver": "opencv", "source": str(tmp_path / "no.avi")}
     save_rig(operator.session, "gone", {"camera": camera, "projector": {"driver": "browser", "size": [640, 480]}})
     assert operator.set_hands_free(False)  # anything that has the session read anew
-    button(page, "1. Rig").click()
+    click(page, "1. Rig")
     for _ in range(2):  # it can be tried again
         choose(page, "Rig", "gone")
         expect(page.get_by_text("no.avi does not exist").first).to_be_visible()

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import zstandard
 from playwright.sync_api import Browser, expect
-from wizard_page import SIZE, Opened, button, choose, field
+from wizard_page import SIZE, Opened, button, choose, click, field
 
 from slviewer.errors import UsageError
 from slviewer.gui.app import App, browser_opened, rig_choice
@@ -21,13 +21,13 @@ def test_from_the_link_to_a_pose_that_a_reload_keeps(opened: Opened, operator: O
     for number, title in enumerate(STEPS, 1):
         expect(button(page, f"{number}. {title}")).to_be_visible()
 
-    button(page, "2. Target").click()
-    button(page, "Use this board").click()
+    click(page, "2. Target")
+    click(page, "Use this board")
     expect(page.get_by_text("In use: circles:21x16:9")).to_be_visible()
-    button(page, "Continue to Poses").click()
+    click(page, "Continue to Poses")
     expect(page.get_by_text("Board detected: 336 of 336 features")).to_be_visible()
-    button(page, "Place board").click()
-    button(page, "Capture pose").click()
+    click(page, "Place board")
+    click(page, "Capture pose")
     expect(page.get_by_text("pose_01").first).to_be_visible()
     assert operator.wait_for(lambda s: (p := s.pose("pose_01")) is not None and p.state == "good", 30.0)
     expect(page.get_by_text("1 pose, 0 scans")).to_be_visible()
@@ -43,9 +43,9 @@ def test_a_guest_sees_the_same_step_and_changes_nothing(opened: Opened, app: App
     guest = browser.new_context(viewport=SIZE).new_page()
     guest.goto(app.server.link("watch"))
     expect(guest.get_by_text("View only")).to_be_visible()
-    button(opened.page, "2. Target").click()
+    click(opened.page, "2. Target")
     expect(button(guest, "Use this board")).to_be_visible()
-    button(guest, "1. Rig").click()
+    click(guest, "1. Rig")
     guest.wait_for_timeout(500)
     assert app.shell.current == "target"
     guest.context.close()
@@ -56,11 +56,11 @@ def test_new_links_end_what_the_old_ones_opened(opened: Opened, app: App, browse
     guest = browser.new_context(viewport=SIZE).new_page()
     guest.goto(old)
     expect(guest.get_by_text("View only")).to_be_visible()
-    button(page, "Links").click()
+    click(page, "Links")
     expect(page.get_by_text(old)).to_be_visible()
     assert old not in guest.content()
     before = page.url
-    button(page, "New links").click()
+    click(page, "New links")
     page.wait_for_url(lambda url: "/operate-" in url and url != before)
     expect(button(page, "1. Rig")).to_be_visible()
     assert app.server.link("watch") != old
@@ -80,11 +80,11 @@ def test_the_password_of_a_camera_reaches_operators_alone(
     guest.on("websocket", lambda socket: socket.on("framereceived", lambda frame: received.append(frame)))
     guest.goto(app.server.link("watch"))
     expect(guest.get_by_text("View only")).to_be_visible()
-    button(page, "1. Rig").click()
+    click(page, "1. Rig")
     choose(page, "Rig", "Custom …")
     field(page, "Camera ID").fill("rtsp://admin:hunter2@127.0.0.1:9/stream")
     page.wait_for_timeout(500)
-    button(page, "Use these devices").click()
+    click(page, "Use these devices")
     expect(page.get_by_text("127.0.0.1/stream").first).to_be_visible()
     page.reload()
     expect(field(page, "Camera ID")).to_have_value("rtsp://admin:hunter2@127.0.0.1:9/stream")
@@ -131,7 +131,7 @@ def test_what_cannot_be_done_is_said_in_words(opened: Opened, tmp_path: Path) ->
     (tmp_path / "a file").write_text("not a session")
     page = opened.page
     field(page, "Folder").fill(str(tmp_path / "a file"))
-    button(page, "Open session").click()
+    click(page, "Open session")
     expect(page.get_by_text("Error", exact=True).first).to_be_visible()
     assert opened.errors == []
 

@@ -12,7 +12,7 @@ import pytest
 import trimesh
 from faulty_rig import Faults, breakable
 from playwright.sync_api import Browser, Page, expect
-from wizard_page import PATIENCE_MS, SIZE, Opened, button, capture_pose, choose, field, pose_row, press
+from wizard_page import PATIENCE_MS, SIZE, Opened, button, capture_pose, choose, click, field, pose_row, press
 
 from slviewer.gui.app import App
 from slviewer.pipeline.rig_choice import Choice, RigSetup, set_up
@@ -82,11 +82,11 @@ def test_from_an_unknown_rig_to_a_merged_cloud(
     try:
         choose(page, "Rig", "Simulated, quarter size")
         expect(page.get_by_text(re.compile(r"camera 400\s×\s300\spx"))).to_be_visible()
-        button(page, "2. Target").click()
-        button(page, "Use this board").click()
+        click(page, "2. Target")
+        click(page, "Use this board")
         expect(page.get_by_text(f"In use: {TARGET}")).to_be_visible()
 
-        button(page, "Continue to Poses").click()
+        click(page, "Continue to Poses")
         for number in range(1, 7):
             if number == 4:
                 page.reload()
@@ -97,7 +97,7 @@ def test_from_an_unknown_rig_to_a_merged_cloud(
                 capture_pose(page, f"pose_{number:02d}")
         expect(page.get_by_text("6 poses, 0 scans")).to_be_visible()
 
-        button(page, "4. Calibrate").click()
+        click(page, "4. Calibrate")
         page.get_by_role("button", name="Calibrate", exact=True).click()
         expect(page.get_by_text("Reprojection RMS, camera")).to_be_visible(timeout=PATIENCE_MS)
         calibration = session_of(bare).calibration
@@ -116,10 +116,10 @@ def test_from_an_unknown_rig_to_a_merged_cloud(
 
 def verify(page: Page, operator: Operator) -> None:
     """A plane and a sphere, each within what the simulated camera's noise lets one expect."""
-    button(page, "5. Verify").click()
+    click(page, "5. Verify")
     for shape, sign in (("plane", "towards the camera"), ("sphere", "outwards")):
         stand(page, shape)
-        button(page, f"Capture {shape}").click()
+        click(page, f"Capture {shape}")
         expect(page.get_by_text(f"errors on one colour scale, red is {sign}")).to_be_visible(timeout=PATIENCE_MS)
     views = session_of(operator).verifications
     rms = {(v.shape, model): mm / v.noise_floor_mm[model] for v in views for model, mm in v.rms_mm.items()}
@@ -140,7 +140,7 @@ def bring(page: Page, operator: Operator, depth: float) -> None:
 
 def scan(page: Page, operator: Operator) -> None:
     """The object at three depths."""
-    button(page, "6. Scan").click()
+    click(page, "6. Scan")
     stand(page, "object")
     choose(page, "Patterns", "micro")
     chosen = operator.wait_for(lambda s: s.session is not None and s.session.patterns == "micro", PATIENCE_S)
@@ -154,7 +154,7 @@ def scan(page: Page, operator: Operator) -> None:
     expect(page.get_by_text("6 poses, 5 scans")).to_be_visible()
     ask(page, "Clicked point")
 
-    button(page, "4. Calibrate").click()  # its curves, at a pixel of this cloud
+    click(page, "4. Calibrate")  # its curves, at a pixel of this cloud
     # far from the click: the pixel that is shown first may be the clicked one. It also waits for this step: Scan has
     # something called Cloud as well
     field(page, "Pixel u").fill("20")
@@ -180,7 +180,7 @@ def ask(page: Page, answer: str) -> None:
 def hands_free(page: Page, name: str) -> None:
     """The next pose by holding still."""
     page.get_by_role("checkbox", name="Hands-free").check()
-    button(page, "Place board").click()
+    click(page, "Place board")
     expect(page.get_by_text("Hold still")).to_be_visible()
     expect(pose_row(page, name, "good")).to_be_visible(timeout=PATIENCE_MS)
     page.get_by_role("checkbox", name="Hands-free").uncheck()
@@ -188,8 +188,8 @@ def hands_free(page: Page, name: str) -> None:
 
 def merge(page: Page, operator: Operator) -> None:
     """All three in the place of the last, by as much as they were moved."""
-    button(page, "7. Merge").click()
-    button(page, "Merge 3 scans").click()
+    click(page, "7. Merge")
+    click(page, "Merge 3 scans")
     expect(page.get_by_text(re.compile("in the frame of"))).to_be_visible(timeout=PATIENCE_MS)
     merged = session_of(operator).merge
     assert merged is not None and merged.reference == "scan_03" and set(merged.pairs) == {"scan_01", "scan_02"}
@@ -202,7 +202,7 @@ def merge(page: Page, operator: Operator) -> None:
 
 def take_home(page: Page, operator: Operator, folder: Path) -> None:
     """The merged cloud, as another program reads it."""
-    button(page, "9. Export").click()
+    click(page, "9. Export")
     with page.expect_download() as download:
         page.get_by_role("link", name="Download").first.click()
     assert download.value.suggested_filename.endswith(".ply")
@@ -229,20 +229,20 @@ def test_whoever_watches_sees_the_pose_and_changes_nothing(
     operator.choose_target(TARGET)
     page, watching = opened.page, visit(browser, app.server.link("watch"))
     guest = watching.page
-    button(page, "3. Poses").click()
+    click(page, "3. Poses")
     capture_pose(page, "pose_01")
     expect(guest.get_by_text("View only")).to_be_visible()
     expect(pose_row(guest, "pose_01", "good")).to_be_visible()
     before = operator.snapshot()
 
-    button(guest, "Place board").click()
-    button(guest, "Capture pose").click()
+    click(guest, "Place board")
+    click(guest, "Capture pose")
     guest.keyboard.press("c")
     guest.get_by_role("checkbox", name="Hands-free").click()
-    button(guest, "Delete").click()
+    click(guest, "Delete")
     field(guest, "Folder").fill(str(operator.snapshot().session.folder / "other"))
-    button(guest, "Open session").click()
-    button(guest, "9. Export").click()
+    click(guest, "Open session")
+    click(guest, "9. Export")
 
     capture_pose(page, "pose_02")  # after all that, what the operator asks for is all that happens
     expect(pose_row(guest, "pose_02", "good")).to_be_visible()
@@ -280,12 +280,12 @@ def test_a_killed_capture_costs_no_earlier_pose(tmp_path: Path, browser: Browser
     program = Program(tmp_path / "session", "--rig", str(rig))
     try:
         page = visit(browser, program.url).page
-        button(page, "2. Target").click()
-        button(page, "Use this board").click()
+        click(page, "2. Target")
+        click(page, "Use this board")
         expect(page.get_by_text(f"In use: {TARGET}")).to_be_visible()
-        button(page, "3. Poses").click()
+        click(page, "3. Poses")
         capture_pose(page, "pose_01")
-        button(page, "Capture pose").click()
+        click(page, "Capture pose")
         page.get_by_text("Capturing pose_02: frame").first.wait_for()
     finally:
         program.kill()
@@ -296,7 +296,7 @@ def test_a_killed_capture_costs_no_earlier_pose(tmp_path: Path, browser: Browser
         again = visit(browser, program.url)
         page = again.page
         expect(page.get_by_text("1 pose, 0 scans")).to_be_visible()
-        button(page, "3. Poses").click()
+        click(page, "3. Poses")
         expect(pose_row(page, "pose_01", "good")).to_be_visible(timeout=PATIENCE_MS)
         capture_pose(page, "pose_02")
         assert again.errors == []
@@ -331,14 +331,14 @@ def test_a_fault_ends_one_capture_and_says_so(tmp_path: Path, browser: Browser) 
         opened = visit(browser, app.server.link())
         page = opened.page
         try:
-            button(page, "3. Poses").click()
+            click(page, "3. Poses")
             capture_pose(page, "pose_01")
             for fault, sentence, after in (
                 ("timeout", "the camera gave no frame within 2 s: check its cable and its trigger", "pose_02"),
                 ("unplugged", "the camera does not answer: plug it in again and reconnect", "pose_03"),
             ):
                 rigs.faults.plan(fault, 10)  # type: ignore[arg-type]
-                button(page, "Capture pose").click()
+                click(page, "Capture pose")
                 expect(page.get_by_role("alert").filter(has_text=sentence)).to_be_visible()
                 expect(button(page, "Capture pose")).to_be_enabled()
                 expect(page.get_by_text(after)).to_have_count(0)

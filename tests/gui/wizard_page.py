@@ -43,6 +43,22 @@ def button(page: Page, name: str) -> Locator:
     return page.get_by_role("button", name=name)
 
 
+STILL = """quiet => new Promise(done => {
+  const end = () => { watcher.disconnect(); done(); };
+  let timer = setTimeout(end, quiet);
+  const watcher = new MutationObserver(() => { clearTimeout(timer); timer = setTimeout(end, quiet); });
+  watcher.observe(document.body, { childList: true, subtree: true });
+  setTimeout(end, 3000);
+})"""
+
+
+def click(page: Page, name: str) -> None:
+    """Click the button that says so once the page stands still: what is drawn anew just then may take the click."""
+    expect(button(page, name)).to_be_enabled()
+    page.evaluate(STILL, 250)
+    button(page, name).click()
+
+
 def field(page: Page, label: str) -> Locator:
     """The input beside this label: viser's labels are text, without a tie to their input."""
     return page.locator(f"xpath=//*[normalize-space(text())='{label}']/following::input[1]")
@@ -81,8 +97,8 @@ def pose_row(page: Page, name: str, state: str) -> Locator:
 def capture_pose(page: Page, name: str) -> None:
     """Put the simulated board where it is asked for, and capture it as this pose, which must be good."""
     expect(button(page, "Place board")).to_be_enabled()
-    button(page, "Place board").click()
-    button(page, "Capture pose").click()
+    click(page, "Place board")
+    click(page, "Capture pose")
     expect(pose_row(page, name, "good")).to_be_visible(timeout=PATIENCE_MS)
 
 
