@@ -1,6 +1,5 @@
 """Projector light and ambient light: exposure, response to grey levels, ambient light, flicker."""
 
-import time
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,8 +10,6 @@ from slviewer.pipeline.exposure_check import CLIPPED, MUCH_CLIPPED, TOO_WEAK, WE
 from slviewer.preflight.rig_under_test import RigUnderTest
 
 _WHITE, _DARK = 24, 24
-_SPREAD_S = 0.01  # one period of 100 Hz, over which images begin: at an even pace they may all see one phase
-_GOLDEN = 0.618034
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,9 +23,13 @@ class Burst:
 
 
 def capture_burst(bench: RigUnderTest) -> Burst:
-    """Capture several images in white light, then several in the dark, with the time at which each began."""
+    """Capture several images in white light, then several in the dark, with the time at which each began.
+
+    The bench's ``unsteady`` rises to what they show: it was measured from fewer images.
+    """
     white_s, white = _grab_images(bench, 255, _WHITE)
     dark_s, dark = _grab_images(bench, None, _DARK)
+    bench.unsteady = max(bench.unsteady, bench.measure_unsteadiness(white), bench.measure_unsteadiness(dark))
     return Burst(white, dark, white_s, dark_s)
 
 
@@ -36,12 +37,7 @@ def _grab_images(bench: RigUnderTest, grey: int | None, count: int) -> tuple[np.
     """Start times (n,) s and images (n, h, w) of ``count`` images under even light."""
     bench.show(grey, "steadiness of the light")
     bench.wait()
-    timed = []
-    for k in range(count):
-        time.sleep(_SPREAD_S * (k * _GOLDEN % 1))
-        timed.append(bench.grab_timed())
-    begin_s, images = zip(*timed, strict=True)
-    return np.array(begin_s), np.stack(images)
+    return bench.grab_spread(count)
 
 
 _TARGET_LEVEL = 0.85  # of full scale, for the 99.5th percentile of what is illuminated

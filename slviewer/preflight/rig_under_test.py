@@ -16,6 +16,8 @@ _DISCARDED_GRABS = 4
 """What a reference waits for: longer than any projector and camera take between them."""
 _MEAN = 8
 _SIGMAS = 6.0
+_SPREAD_S = 0.01  # one period of 100 Hz, over which images begin: at an even pace they may all see one phase
+_GOLDEN = 0.618034
 
 
 class RigUnderTest:
@@ -49,6 +51,15 @@ class RigUnderTest:
         start_s = time.monotonic()
         return start_s, self.grab()
 
+    def grab_spread(self, count: int) -> tuple[np.ndarray, np.ndarray]:
+        """Start times (n,) s and images (n, h, w) of the next ``count`` images, spread over the mains period."""
+        timed = []
+        for k in range(count):
+            time.sleep(_SPREAD_S * (k * _GOLDEN % 1))
+            timed.append(self.grab_timed())
+        start_s, images = zip(*timed, strict=True)
+        return np.array(start_s), np.stack(images)
+
     def show(self, grey: int | None, doing: str) -> None:
         """Project even light of a grey level, without waiting for it. May raise Cancelled."""
         self._tick(doing)
@@ -76,7 +87,7 @@ class RigUnderTest:
                 self.grab()
                 passed += 1
                 time.sleep(max(0.0, min(0.02, end - time.monotonic())))
-            bursts.append(np.stack([self.grab() for _ in range(_MEAN)]))
+            bursts.append(self.grab_spread(_MEAN)[1])
         dark, white = bursts
         self.dark, self.white = dark.mean(axis=0), white.mean(axis=0)
         difference = white[1] - white[0]
@@ -85,7 +96,11 @@ class RigUnderTest:
         swing = max(float(np.std([np.median(image) for image in images])) for images in bursts)
         self.illuminated = self.white - self.dark > max(_SIGMAS * self.noise, 0.02 * self.full, 3 * swing)
         if self.illuminated.any():
-            self.unsteady = max(float(np.std([self.share(i, self.illuminated) for i in images])) for images in bursts)
+            self.unsteady = max(map(self.measure_unsteadiness, bursts))
+
+    def measure_unsteadiness(self, images: np.ndarray) -> float:
+        """By how much images (n, h, w) under even light differ as a whole, as a share of the white light (rms)."""
+        return float(np.std([self.share(image, self.illuminated) for image in images]))
 
     @property
     def full(self) -> float:
