@@ -27,7 +27,7 @@ project = "slviewer"
 copyright = "the authors of slviewer"
 version = release = slviewer.__version__
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
-exclude_patterns = ["_build"]
+exclude_patterns = ["_build", "examples/slviewer-example-plugin"]
 suppress_warnings = ["myst.xref_missing"]  # links to files of the repository that are no pages
 autodoc_typehints = "description"
 autodoc_member_order = "bysource"
@@ -73,7 +73,9 @@ def list_functions() -> str:
     for name in slviewer.__all__:
         public = getattr(slviewer, name)
         if inspect.ismodule(public):
-            lines += [f".. automodule:: {public.__name__}", "   :members:", ""]
+            # once is enough for what slviewer exports itself
+            again = ", ".join(sorted(set(slviewer.__all__) & set(getattr(public, "__all__", ()))))
+            lines += [f".. automodule:: {public.__name__}", "   :members:", f"   :exclude-members: {again}", ""]
             continue
         lines += [f".. {'autoclass' if isinstance(public, type) else 'autofunction'}:: slviewer.{name}", ""]
     return "\n".join([*lines, "```", ""])

@@ -36,6 +36,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from slviewer import plugins
     from slviewer.errors import SlviewerError
     from slviewer.evaluation.plane import evaluate_plane
     from slviewer.evaluation.sphere import evaluate_sphere
@@ -100,6 +101,7 @@ _EXPORTS = {
     "micro": "fringe.presets",
     "multifrequency": "fringe.presets",
     "p18": "fringe.presets",
+    "plugins": "plugins:*",
     "read_captures": "pipeline.import_captures",
     "reconstruct": "pipeline.reconstruct",
     "reconstruct_cloud": "reconstruction.reconstruct:reconstruct",
@@ -114,8 +116,8 @@ __all__ = [
     "Board", "CalibrationResult", "Cloud", "Frame", "PatternSequence", "PhaseMap", "Session", "SlviewerError",
     "align_clouds", "calibrate", "calibrate_frames", "check_description", "complementary", "datasets", "decode",
     "detect_board", "draw_error_maps", "evaluate_plane", "evaluate_sphere", "fuse_clouds", "gray", "import_captures",
-    "load_calibration", "measure", "merge", "mesh", "mesh_cloud", "micro", "multifrequency", "p18", "read_captures",
-    "reconstruct", "reconstruct_cloud", "save_calibration", "texture", "verify", "write_ply",
+    "load_calibration", "measure", "merge", "mesh", "mesh_cloud", "micro", "multifrequency", "p18", "plugins",
+    "read_captures", "reconstruct", "reconstruct_cloud", "save_calibration", "texture", "verify", "write_ply",
 ]  # fmt: skip
 
 

@@ -68,6 +68,7 @@ COMMANDS = Commands(
     {
         "wizard": lambda: wizard,
         "devices": partial(read_command, "pipeline.devices:devices"),
+        "plugins": partial(read_command, "pipeline.plugins:plugins"),
         "preflight": partial(read_command, "preflight.check_rig:check_rig", options=CHECKED, run=run_preflight),
         "capture": partial(
             read_command, "pipeline.capture:capture", "session", "name", options=[*PAGES], run=run_capture

@@ -13,6 +13,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 PACKAGES = [
     "errors",
+    "entry_points",
     "printable",
     "records",
     "geometry",
@@ -29,6 +30,7 @@ PACKAGES = [
     "session",
     "report",
     "pipeline",
+    "plugins",
     "preflight",
     "wizard",
     "server",

@@ -7,6 +7,7 @@ from typing import Any, Literal
 
 from slviewer import terminal
 from slviewer.commands.command import Option, Run, call, read_command, union
+from slviewer.entry_points import IMPORTERS, list_names
 from slviewer.errors import InputError, UsageError
 
 CODEC = Option(
@@ -165,5 +166,7 @@ def make_import_command() -> Callable[..., Callable[[], None]]:
         run: Callable[[], None] = command
         return run
 
+    for name in sorted(set(list_names(IMPORTERS)) - layouts.keys()):
+        layouts[name] = _make_captures_command(name, f"Import folders of the layout {name}, which a plugin reads.")
     import_command.__annotations__["command"] = union(layouts)
     return import_command

@@ -1,4 +1,4 @@
-"""Drivers by name: every file of this folder that holds a `DRIVER` is one."""
+"""Drivers by name: every file of this folder that holds a `DRIVER` is one, and plugins add others."""
 
 import importlib
 import pkgutil
@@ -9,6 +9,7 @@ from importlib.util import find_spec
 
 import slviewer.devices
 from slviewer.devices.protocols import Camera, Projector, Rig, Turntable
+from slviewer.entry_points import DRIVERS, explain_missing, usable_plugins
 from slviewer.errors import DeviceError, InputError
 
 
@@ -43,9 +44,15 @@ class Driver:
         )
 
 
-@cache
 def drivers() -> dict[str, Driver]:
-    """Return all drivers by name, usable here or not."""
+    """Return all drivers by name, usable here or not; those of plugins last."""
+    built_in = builtin_drivers()
+    return built_in | usable_plugins(DRIVERS, Driver, frozenset(built_in))
+
+
+@cache
+def builtin_drivers() -> dict[str, Driver]:
+    """Return the drivers of this folder by name."""
     modules = (module.name for module in pkgutil.iter_modules(slviewer.devices.__path__))
     candidates = (getattr(importlib.import_module(f"slviewer.devices.{name}"), "DRIVER", None) for name in modules)
     return {driver.name: driver for driver in candidates if isinstance(driver, Driver)}
@@ -59,7 +66,9 @@ def available() -> list[Driver]:
 def driver(name: str) -> Driver:
     """Return the driver called `name`. Raises InputError if there is none, DeviceError if it lacks a package."""
     if name not in drivers():
-        raise InputError(f"no driver is called {name!r}: use one of {', '.join(sorted(drivers()))}")
+        raise InputError(
+            f"no driver is called {name!r}: use one of {', '.join(sorted(drivers()))}{explain_missing(DRIVERS, name)}"
+        )
     selected = drivers()[name]
     if selected.missing:
         raise DeviceError(f"the driver {name} cannot be used here, {selected.missing}")

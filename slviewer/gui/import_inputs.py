@@ -9,7 +9,7 @@ from slviewer.gui.panel import PanelContext
 from slviewer.gui.widgets import Text
 from slviewer.session.capture import Role
 from slviewer.session.importers.images import DEFAULT_CHANNEL, Channel
-from slviewer.session.importers.layouts import LAYOUTS
+from slviewer.session.importers.layouts import layouts
 from slviewer.session.importers.slstudio import Codec
 from slviewer.wizard.snapshot import Snapshot
 
@@ -27,7 +27,7 @@ class ImportInputs:
         with gui.add_folder("Import captures", expand_by_default=False):
             Text(gui).write(f"Imports images of another program as {_RESULTS[role]}, one folder each.", "dim")
             self._layout = Choice(gui, "Layout", "How the files are named; detect uses the names, or a TOML")
-            self._layout.offer([(_DETECT, _DETECT), *((name, name) for name in LAYOUTS)])
+            self._layout.offer([(_DETECT, _DETECT), *((name, name) for name in layouts())])
             self._description = Text(gui)
             self._projector = gui.add_text("Projector", "", hint="Columns x rows, for example 1280x800")
             self._size_hint = Text(gui)
@@ -52,7 +52,7 @@ class ImportInputs:
     def _describe(self) -> None:
         """Describe the chosen layout, and show the inputs that it needs."""
         name = self._layout.value
-        layout = LAYOUTS.get(name)
+        layout = layouts().get(name)
         self._description.write(f"Contains {layout.holds}." if layout else "", "dim")
         change(self._codec, visible=name == "slstudio")
         size = layout.projector if layout else None

@@ -18,7 +18,7 @@ from slviewer.pipeline.open_session import SessionLike, opened
 from slviewer.pipeline.report import report
 from slviewer.pipeline.scan_edits import refuse_region
 from slviewer.session.atomic import format_bytes
-from slviewer.session.mesh_files import IN_WORDS, MESH_FORMATS, POINT_FORMATS, estimated_bytes, write_shape
+from slviewer.session.mesh_files import IN_WORDS, estimated_bytes, exporters, mesh_formats, point_formats, write_shape
 from slviewer.session.reading import expand_user
 from slviewer.session.store import Session
 from slviewer.surface.meshing import MeshingPlan
@@ -26,18 +26,13 @@ from slviewer.surface.meshing import MeshingPlan
 What = Literal["cloud", "mesh", "merge", "merged-mesh", "calibration", "coefficients", "poses", "report", "table"]
 """A scan's points, its mesh, the points of a merge, one mesh through them, the calibration, the coefficients of each
 pixel, poses of devices, boards and scans, the report, the verifications."""
-FORMATS: dict[What, tuple[str, ...]] = {
-    "cloud": POINT_FORMATS,
-    "mesh": MESH_FORMATS[:5],
-    "merge": POINT_FORMATS,
-    "merged-mesh": MESH_FORMATS[:5],
+_DOCUMENT_FORMATS: dict[str, tuple[str, ...]] = {
     "calibration": ("yml", "xml", "json"),
     "coefficients": ("npz",),
     "poses": ("json", "yml", "xml"),
     "report": ("html",),
     "table": ("csv",),
 }
-"""The first is the default."""
 DOCUMENTS = {
     "yml": "OpenCV's YAML in mm and px, explained in comments",
     "xml": "OpenCV's XML in mm and px, explained in comments",
@@ -48,6 +43,17 @@ DOCUMENTS = {
 }
 """What the other formats are, and in which units."""
 _ALIASES = {"yaml": "yml", "htm": "html"}
+
+
+def formats(what: What) -> tuple[str, ...]:
+    """Return the formats of an export; the first is the default. Raises InputError for what cannot be exported."""
+    if what not in get_args(What):
+        raise InputError(f"{what!r} cannot be exported: choose one of {', '.join(get_args(What))}")
+    if what in ("cloud", "merge"):
+        return point_formats()
+    if what in ("mesh", "merged-mesh"):
+        return tuple(each for each in mesh_formats() if each != "xyz")
+    return _DOCUMENT_FORMATS[what]
 
 
 @dataclass(frozen=True)
@@ -66,7 +72,8 @@ class Exported:
 
 def describe_format(file_format: str) -> str:
     """Describe what a format contains and in which units."""
-    return IN_WORDS.get(file_format) or DOCUMENTS.get(file_format, "")
+    added = exporters().get(file_format)
+    return added.what if added else IN_WORDS.get(file_format) or DOCUMENTS.get(file_format, "")
 
 
 def estimate_file_bytes(
@@ -84,10 +91,8 @@ def estimate_file_bytes(
 
 def check_export(what: What, file_format: str) -> None:
     """Raise InputError for something that cannot be exported, or not in this format."""
-    if what not in get_args(What):
-        raise InputError(f"{what!r} cannot be exported: choose one of {', '.join(get_args(What))}")
-    if _ALIASES.get(file_format, file_format) not in FORMATS[what]:
-        listed = ", ".join(f".{each}" for each in FORMATS[what])
+    if _ALIASES.get(file_format, file_format) not in formats(what):
+        listed = ", ".join(f".{each}" for each in formats(what))
         raise InputError(f"the {what} cannot be written as .{file_format}: choose {listed}")
 
 
@@ -132,7 +137,7 @@ def export(
     """
     with opened(session) as store:
         chosen = file_format.lower().removeprefix(".")
-        check_export(what, chosen or FORMATS.get(what, ("",))[0])
+        check_export(what, chosen or formats(what)[0])
         name = _resolve_name(store, what, name)
         target = _output_path(store, what, name, out, chosen)
         if what not in ("report", "table"):
@@ -211,7 +216,7 @@ def _output_path(store: Session, what: What, name: str, out: Path | str | None, 
     """Return the path of the file to write, with a suffix that fits the format."""
     given = None if out is None else expand_user(out)
     if given is None or given.is_dir():
-        return (given or store.exports) / default_file_name(what, name, chosen or FORMATS[what][0])
+        return (given or store.exports) / default_file_name(what, name, chosen or formats(what)[0])
     suffix = given.suffix.lower().removeprefix(".")
     if chosen and suffix != chosen:
         return given.with_name(f"{given.name}.{chosen}")

@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, get_args
 
+from slviewer.entry_points import IMPORTERS, explain_missing
 from slviewer.errors import InputError
 from slviewer.fringe.description_check import check_description
 from slviewer.fringe.origin import estimate_gray_origin
@@ -25,7 +26,7 @@ from slviewer.session.importers import guessed_description
 from slviewer.session.importers.guessed_description import GuessedDescription
 from slviewer.session.importers.images import Channel
 from slviewer.session.importers.imported import ImportableRecording, Imports, Skipped, none_usable
-from slviewer.session.importers.layouts import LAYOUTS, detect_layout, find_description
+from slviewer.session.importers.layouts import detect_layout, find_description, layouts
 from slviewer.session.layout import is_session
 from slviewer.session.reading import expand_user
 from slviewer.session.store import Session
@@ -64,7 +65,7 @@ def import_captures(
         force: Replace captures of the same name (the old ones go to the session's trash).
         strict: Import nothing where one capture cannot be used, instead of skipping it with a warning.
 
-    ``layout`` is one of `layouts.LAYOUTS`, or "detect": the one that the file names show. Captures are named after
+    ``layout`` is one of `layouts.layouts()`, or "detect": the one that the file names show. Captures are named after
     their folders. ``sequence`` is the TOML of the layout frames, by default the one in ``source``. ``origin`` is
     recorded as where the captures come from, by default their folders. ``options`` are those of the layout's `read`.
 
@@ -123,9 +124,12 @@ def find_captures(
     source = expand_user(source)
     if layout == "detect":
         layout = "frames" if sequence is not None else detect_layout(source)
-    if layout not in LAYOUTS:
-        raise InputError(f"the layout {layout!r} is unknown: use {', '.join(LAYOUTS)}")
-    size = LAYOUTS[layout].projector if projector is None else parse_size(projector)
+    known = layouts()
+    if layout not in known:
+        raise InputError(
+            f"the layout {layout!r} is unknown: use {', '.join(known)}{explain_missing(IMPORTERS, layout)}"
+        )
+    size = known[layout].projector if projector is None else parse_size(projector)
     if layout == "frames":
         toml = sequence or find_description(source)
         if toml is None:
@@ -135,7 +139,7 @@ def find_captures(
         warn(
             f"the projector is assumed to have {size[0]}x{size[1]} px, as in the session: --projector for another size"
         )
-    imports = LAYOUTS[layout].read(source, prefix=prefix, projector=size, **options)
+    imports = known[layout].read(source, prefix=prefix, projector=size, **options)
     if channel is not None:
         imports = replace(imports, recordings=[replace(recording, channel=channel) for recording in imports.recordings])
     return imports

@@ -56,8 +56,8 @@ def reel(
 ) -> Reel:
     """Read the captures in `source`, or the one of that name, for a replayed rig.
 
-    `layout` is session or one of `layouts.LAYOUTS`, by default what `source` looks like; `sequence` is the TOML of the
-    layout frames, `projector` its size, such as "912x1140", where it is not the layout's own. Raises InputError,
+    `layout` is session or one of `layouts.layouts()`, by default what `source` looks like; `sequence` is the TOML of
+    the layout frames, `projector` its size, such as "912x1140", where it is not the layout's own. Raises InputError,
     SessionError.
     """
     folder = expand_user(source)

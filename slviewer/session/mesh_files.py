@@ -10,12 +10,14 @@
 `.xyz`   text, mm: x y z of a point a line, and its red green blue; no other line, which most readers would not bear
 =======  ===========================================================================================================
 
-Files appear whole or not at all. In glTF y points up and the viewer looks along -z: its node turns the camera's frame,
-whose y points down and whose z points away, by half a turn about x, so that an object stands as the camera saw it.
+Plugins add other formats, an `Exporter` each. Files appear whole or not at all. In glTF y points up and the viewer
+looks along -z: its node turns the camera's frame, whose y points down and whose z points away, by half a turn about x,
+so that an object stands as the camera saw it.
 """
 
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -23,6 +25,7 @@ from typing import Any
 import numpy as np
 
 from slviewer import __version__
+from slviewer.entry_points import EXPORTERS, usable_plugins
 from slviewer.errors import InputError
 from slviewer.session.atomic import arriving_file, arriving_path, replace_file
 from slviewer.session.cad import require_packages
@@ -49,6 +52,36 @@ _NUMBER, _SMALL, _GREY = 11, 9, 4
 """Characters that a coordinate, a sigma or a part of a normal, and a grey level take in text, with the blank."""
 
 
+@dataclass(frozen=True)
+class Exporter:
+    """A file format that a plugin adds; ``name`` is its suffix in lower case, without the dot.
+
+    ``what``: unit and content, in a few words. ``encode(shape, scalars, notes)`` returns the content of the file, of a
+    `PointSet` or, with ``takes_meshes``, a `Mesh`, in mm; scalars and notes as in `write_shape`.
+    """
+
+    name: str
+    what: str
+    encode: Callable[[PointSet | Mesh, Mapping[str, np.ndarray], Sequence[str]], bytes]
+    takes_points: bool = True
+    takes_meshes: bool = False
+
+
+def exporters() -> dict[str, Exporter]:
+    """Return the formats of plugins by name."""
+    return usable_plugins(EXPORTERS, Exporter, frozenset(IN_WORDS))
+
+
+def point_formats() -> tuple[str, ...]:
+    """Return the suffixes in which points can be written, those of plugins last."""
+    return (*POINT_FORMATS, *(name for name, added in exporters().items() if added.takes_points))
+
+
+def mesh_formats() -> tuple[str, ...]:
+    """Return the suffixes in which meshes can be written, those of plugins last."""
+    return (*MESH_FORMATS, *(name for name, added in exporters().items() if added.takes_meshes))
+
+
 def write_shape(
     path: str | Path,
     shape: PointSet | Mesh,
@@ -67,10 +100,10 @@ def write_shape(
     path = Path(path)
     file_format = path.suffix.lower().removeprefix(".")
     points, faces = (shape.vertices, shape.faces) if isinstance(shape, Mesh) else (shape.points, None)
-    formats = POINT_FORMATS if faces is None else MESH_FORMATS
+    formats = point_formats() if faces is None else mesh_formats()
     if file_format not in formats:
         what = "a cloud" if faces is None else "a mesh"
-        why = ": it has no triangles" if file_format in MESH_FORMATS else ""
+        why = ": it has no triangles" if file_format in mesh_formats() else ""
         listed = ", ".join(f".{each}" for each in formats)
         raise InputError(f"{path.name}: {what} cannot be written so{why}; choose one of {listed}")
     if not len(points) or (faces is not None and not len(faces)):
@@ -88,6 +121,8 @@ def write_shape(
         _write_xyz(path, points, shape.colours)
     elif file_format == "e57":
         _write_e57(path, points, shape.colours, notes)
+    elif added := exporters().get(file_format):
+        replace_file(path, added.encode(shape, values, notes))
     else:
         encode = {"stl": _encode_stl, "obj": _encode_obj, "glb": _encode_glb, "3mf": _encode_3mf}[file_format]
         replace_file(path, encode(shape, notes))

@@ -130,8 +130,8 @@ def printed_board(
     `diameter_mm` says otherwise; `marked` adds the mark of the printed sheets. Raises `InputError` for ChArUco boards,
     which the simulation does not print.
     """
-    if board.kind == "charuco":
-        raise InputError("the simulation does not print ChArUco boards: use circles, acircles or a chessboard")
+    if board.kind not in ("circles", "acircles", "chessboard"):
+        raise InputError(f"the simulation does not print {board.kind} boards: use circles, acircles or a chessboard")
     diameter = (board.pitch_mm / 2 if diameter_mm is None else diameter_mm) if board.kind != "chessboard" else 0.0
     if diameter > 0.6 * board.pitch_mm:
         raise InputError(f"circles of {diameter:g} mm at a pitch of {board.pitch_mm:g} mm: give 0.6 pitches at most")

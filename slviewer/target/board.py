@@ -8,17 +8,21 @@
                                defaults, ``:marker mm`` (0.75 of the square) and ``:dictionary`` (DICT_5X5_1000).
                                The layout is OpenCV's since 4.6: the top-left square is dark
 =============================  ================================================================================
+
+Plugins add others (`BoardType`).
 """
 
 import math
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal, cast, get_args
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from slviewer.entry_points import BOARDS, explain_missing, usable_plugins
 from slviewer.errors import InputError
 
 Kind = Literal["circles", "acircles", "chessboard", "charuco"]
@@ -29,10 +33,42 @@ EXAMPLES = {
     "chessboard": "chessboard:9x7:75",
     "charuco": "charuco:8x6:30",
 }
+_OUTLINE_SQUARES = {"circles": 0.5, "acircles": 0.5, "chessboard": 0.95, "charuco": 1.0}
 DEFAULT_DICTIONARY = "DICT_5X5_1000"
 DEFAULT_MARKER = 0.75
 """Side of a ChArUco marker in squares."""
 _DICTIONARY = re.compile(r"DICT_([4-7])X\1_(50|100|250|1000)")
+
+
+@dataclass(frozen=True)
+class BoardType:
+    """A kind of board, written ``NAME:COLUMNSxROWS:PITCH`` as in ``example``.
+
+    ``features(board)``: (columns, rows) of its features. ``points(board)``: their coordinates (n, 3) float64 mm, row by
+    row, z = 0, x along a row and y along a column, as in `Board`. ``detect(board, image)``: of an image (h, w) uint8
+    the detected features as ``pixels`` (m, 2) float64 px and ``ids`` (m,) int, their indices into the points; it raises
+    DetectionError rather than return a wrong number. ``margin_pitches``: what of the board surely lies beyond the
+    outermost features, in pitches. ``what``: its name in the wizard; ``counts``: what columns, rows and pitch mean.
+    """
+
+    name: str
+    what: str
+    counts: str
+    example: str
+    features: Callable[["Board"], tuple[int, int]]
+    points: Callable[["Board"], NDArray[np.float64]]
+    detect: Callable[["Board", NDArray[np.uint8]], tuple[NDArray[np.float64], np.ndarray]]
+    margin_pitches: float = 0.0
+
+
+def plugin_boards() -> dict[str, BoardType]:
+    """Return the board types that plugins add, by name."""
+    return usable_plugins(BOARDS, BoardType, frozenset(EXAMPLES))
+
+
+def board_examples() -> dict[str, str]:
+    """Return a notation of each kind of board, those of plugins last."""
+    return EXAMPLES | {name: added.example for name, added in plugin_boards().items()}
 
 
 @dataclass(frozen=True)
@@ -41,10 +77,10 @@ class Board:
 
     ``points``: the features, row by row: x along a row, y along a column, so that the normal (x cross y) points
     away from a camera that sees the printed side; the first feature is the origin. ``marker_mm`` and
-    ``dictionary`` belong to ChArUco boards only.
+    ``dictionary`` belong to ChArUco boards only. ``kind``: a `Kind`, or the name of a plugin's `BoardType`.
     """
 
-    kind: Kind
+    kind: str
     columns: int
     rows: int
     pitch_mm: float
@@ -52,17 +88,21 @@ class Board:
     dictionary: str = ""
 
     def __post_init__(self) -> None:
-        if self.kind not in EXAMPLES:
-            raise InputError(f"there is no board of kind '{self.kind}': use one of {', '.join(EXAMPLES)}")
-        least = 2 if self.kind == "acircles" else 3
-        if not (least <= self.columns <= 200 and 3 <= self.rows <= 200):
+        examples = EXAMPLES if self.kind in EXAMPLES else board_examples()
+        if self.kind not in examples:
             raise InputError(
-                f"a {self.kind} board of {self.columns}x{self.rows} cannot be used: give {least} to 200 columns and "
-                f"3 to 200 rows, as in '{EXAMPLES[self.kind]}'"
+                f"there is no board of kind '{self.kind}': use one of {', '.join(examples)}"
+                + explain_missing(BOARDS, self.kind)
+            )
+        fewest = {"acircles": (2, 3)}.get(self.kind, (3, 3) if self.kind in EXAMPLES else (1, 1))
+        if not (fewest[0] <= self.columns <= 200 and fewest[1] <= self.rows <= 200):
+            raise InputError(
+                f"a {self.kind} board of {self.columns}x{self.rows} cannot be used: give {fewest[0]} to 200 columns "
+                f"and {fewest[1]} to 200 rows, as in '{examples[self.kind]}'"
             )
         if not (math.isfinite(self.pitch_mm) and 0.01 <= self.pitch_mm <= 10_000):
             raise InputError(
-                f"a pitch of {self.pitch_mm:g} mm cannot be used: give 0.01 to 10000 mm, as in '{EXAMPLES[self.kind]}'"
+                f"a pitch of {self.pitch_mm:g} mm cannot be used: give 0.01 to 10000 mm, as in '{examples[self.kind]}'"
             )
         if self.kind == "charuco":
             self._check_markers()
@@ -98,12 +138,13 @@ class Board:
         """Parse a notation such as ``circles:21x16:9``; raises InputError for others."""
         kind, *fields = notation.strip().split(":")
         kind = kind.strip().lower()
-        if kind not in get_args(Kind):
+        examples = EXAMPLES if kind in EXAMPLES else board_examples()
+        if kind not in examples:
             raise InputError(
-                f"board '{notation}' is not understood: start it with one of {', '.join(EXAMPLES)}, "
-                f"for example '{EXAMPLES['circles']}'"
+                f"board '{notation}' is not understood: start it with one of {', '.join(examples)}, "
+                f"for example '{EXAMPLES['circles']}'" + explain_missing(BOARDS, kind)
             )
-        example = EXAMPLES[kind]
+        example = examples[kind]
         most = 4 if kind == "charuco" else 2
         if not 2 <= len(fields) <= most:
             raise InputError(
@@ -116,7 +157,7 @@ class Board:
         pitch = _parse_millimetres(notation, fields[1], example)
         marker = _parse_millimetres(notation, fields[2], example) if len(fields) > 2 else 0.0
         dictionary = fields[3].strip().upper() if len(fields) > 3 else ""
-        return cls(cast(Kind, kind), int(size[1]), int(size[2]), pitch, marker, dictionary)
+        return cls(kind, int(size[1]), int(size[2]), pitch, marker, dictionary)
 
     def __str__(self) -> str:
         fields = [self.kind, f"{self.columns}x{self.rows}", _format_number(self.pitch_mm)]
@@ -131,7 +172,14 @@ class Board:
     @property
     def features(self) -> tuple[int, int]:
         """(columns, rows) of features: a ChArUco board of c x r squares has (c - 1) x (r - 1) inner corners."""
+        if added := self.plugin_type:
+            return added.features(self)
         return (self.columns - 1, self.rows - 1) if self.kind == "charuco" else (self.columns, self.rows)
+
+    @property
+    def plugin_type(self) -> BoardType | None:
+        """The type of a plugin's board; None for the kinds that are built in."""
+        return None if self.kind in EXAMPLES else plugin_boards()[self.kind]
 
     @cached_property
     def points(self) -> NDArray[np.float64]:
@@ -140,6 +188,13 @@ class Board:
         i, j = np.divmod(np.arange(columns * rows), columns)
         x = 2 * j + i % 2 if self.kind == "acircles" else j
         points = np.stack([x, i, np.zeros(len(i))], axis=1) * self.pitch_mm
+        if added := self.plugin_type:
+            points = np.array(added.points(self), np.float64)
+            if points.shape != (columns * rows, 3) or not np.isfinite(points).all() or points[:, 2].any():
+                raise InputError(
+                    f"the plugin of {self.kind} boards gives points of shape {points.shape} for {columns}x{rows} "
+                    "features: it must give (n, 3) mm with z = 0, row by row"
+                )
         points.flags.writeable = False
         return points
 
@@ -150,7 +205,8 @@ class Board:
         for circles, 0.95 of a square for a chessboard's inner corners, the whole sheet of squares for ChArUco.
         """
         if margin_mm is None:
-            squares = {"circles": 0.5, "acircles": 0.5, "chessboard": 0.95, "charuco": 1.0}[self.kind]
+            added = self.plugin_type
+            squares = added.margin_pitches if added else _OUTLINE_SQUARES[self.kind]
             margin_mm = squares * self.pitch_mm
         x0, y0 = self.points[:, :2].min(0) - margin_mm
         x1, y1 = self.points[:, :2].max(0) + margin_mm

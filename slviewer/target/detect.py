@@ -6,13 +6,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slviewer.errors import InputError
+from slviewer.errors import DetectionError, InputError
 from slviewer.target.board import Board
 from slviewer.target.charuco import detect_charuco
 from slviewer.target.chessboard import detect_chessboard
 from slviewer.target.circles import detect_circles
 from slviewer.target.images import BoardImage
 from slviewer.target.planar import fit_homography, to_image
+
+_FEWEST = 6
+"""Features of a plugin's board that fix its pose with some to spare."""
 
 
 @dataclass(frozen=True)
@@ -43,11 +46,29 @@ def detect(board: Board, image: np.ndarray) -> Detection:
     if board.kind == "charuco":
         pixels, ids = detect_charuco(board, board_image)
         return Detection(pixels, ids)
+    if added := board.plugin_type:
+        pixels, ids = added.detect(board, board_image.grey)
+        return _check_detection(board, pixels, ids)
     ids = np.arange(len(board.points))
     if board.kind == "chessboard":
         return Detection(detect_chessboard(board, board_image), ids)
     pixels, radius, marked = detect_circles(board, board_image)
     return Detection(pixels, ids, radius, marked)
+
+
+def _check_detection(board: Board, pixels: np.ndarray, ids: np.ndarray) -> Detection:
+    """Return what a plugin's detector found. Raises DetectionError where its numbers cannot be those of the board."""
+    pixels, ids = np.asarray(pixels, np.float64), np.asarray(ids)
+    known = len(board.points)
+    distinct = pixels.shape == (len(ids), 2) and np.isfinite(pixels).all() and len(np.unique(ids)) == len(ids)
+    if not distinct or (len(ids) and (ids.min() < 0 or ids.max() >= known)):
+        raise DetectionError(
+            f"the plugin of {board.kind} boards returned features that are not distinct, or not among the {known} of "
+            "the board: report it to its maker"
+        )
+    if len(ids) < _FEWEST:
+        raise DetectionError(f"{len(ids)} of {known} features were detected: show the whole board, evenly lit")
+    return Detection(pixels, ids.astype(int))
 
 
 def board_mask(board: Board, detection: Detection, shape: tuple[int, ...]) -> NDArray[np.bool_]:

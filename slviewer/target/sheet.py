@@ -47,6 +47,8 @@ def write_drawing(drawing: Drawing, path: Path) -> None:
 
 def draw_board(board: Board, margin_mm: float | None = None) -> Drawing:
     """Draw a board on its page, with a footer; ``margin_mm`` as in ``write_sheet``."""
+    if board.plugin_type:
+        raise InputError(f"{board.kind} boards come from a plugin and cannot be drawn: print its maker's file")
     mark = mark_geometry(board)
     radius = CIRCLE_SHARE / 2 * neighbour_distance_mm(board)
     needed_margin = (

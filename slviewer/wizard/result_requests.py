@@ -7,7 +7,7 @@ from slviewer.errors import InputError
 from slviewer.pipeline.align import FOLDER as PLACEMENTS
 from slviewer.pipeline.align import Placement, remove_placement
 from slviewer.pipeline.calibrate import CalibrationResult
-from slviewer.pipeline.export import FORMATS, What, check_export
+from slviewer.pipeline.export import What, check_export, formats
 from slviewer.pipeline.models import accept_rejected_calibration, accepts_rejected, available_models, check_accepted
 from slviewer.pipeline.verify import Shape
 from slviewer.session.names import clean_label
@@ -151,12 +151,12 @@ class ResultRequests(RequestHandler):
         texture: int | None = None,
         white: str = "",
     ) -> None:
-        """Write a file into the session's exports. `export.FORMATS` lists what can be exported and the formats, the
-        first is the default. `name`: the scan of a cloud or a mesh, the model of coefficients; a merge is the current
+        """Write a file into the session's exports. `export.formats` lists the formats, the first is
+        the default. `name`: the scan of a cloud or a mesh, the model of coefficients; a merge is the current
         one. `plan`: how to mesh; `texture`: side of its image, px, of a .glb or .obj; `white`: its white balance.
         """
         store, view = self._engine.store, self._engine.publisher.refresh().session
-        chosen = file_format or FORMATS.get(what, ("",))[0]
+        chosen = file_format or formats(what)[0]
         check_export(what, chosen)
         if what not in ("report", "table"):
             check_accepted(store, accepts_rejected(store))

@@ -19,7 +19,7 @@ from slviewer.fringe.presets import PRESETS
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.rig import StereoRig
 from slviewer.pipeline.compare import compare
-from slviewer.pipeline.export import FORMATS, export
+from slviewer.pipeline.export import export, formats
 from slviewer.pipeline.mesh import mesh
 from slviewer.pipeline.models import save_fitted, save_stereo
 from slviewer.session.importers import opencv_calibration
@@ -136,7 +136,7 @@ def test_a_merge_and_one_surface_through_it(kept: Path, tmp_path: Path) -> None:
     assert np.median(off) < 0.3 and off.max() < 10  # beyond the limb, which so few pixels show, it is cut a little late
 
 
-@pytest.mark.parametrize("suffix", FORMATS["calibration"])
+@pytest.mark.parametrize("suffix", formats("calibration"))
 def test_a_calibration_comes_back(kept: Path, tmp_path: Path, suffix: str) -> None:
     path = export(kept, "calibration", out=tmp_path / f"c.{suffix}").path
     read = opencv_calibration.read_matrices(read_storage(path))

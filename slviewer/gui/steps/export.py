@@ -12,15 +12,15 @@ from slviewer.gui.inputs import Choice, change, display_name
 from slviewer.gui.panel import PanelContext, StepPanel
 from slviewer.gui.widgets import Html, Text, coloured, link, paragraph, table, to_html
 from slviewer.pipeline.export import (
-    FORMATS,
     What,
     default_file_name,
     describe_format,
     estimate_file_bytes,
+    formats,
 )
 from slviewer.pipeline.white_balance import BOARD
 from slviewer.session.atomic import format_bytes
-from slviewer.session.mesh_files import MESH_FORMATS, POINT_FORMATS
+from slviewer.session.mesh_files import mesh_formats, point_formats
 from slviewer.surface.meshing import MeshingPlan, Method
 from slviewer.wizard import result_views
 from slviewer.wizard.snapshot import ExportView, SessionView, Snapshot
@@ -50,7 +50,6 @@ NUMBERS: dict[What, tuple[str, str]] = {
 }
 """Other exports than shapes: the choice, and its content."""
 _QUIET = "color:var(--mantine-color-anchor);font-weight:600;text-decoration:none"
-_SHAPED = {*POINT_FORMATS, *MESH_FORMATS}
 TEXTURED_FORMATS = ("glb", "obj")
 METHODS: dict[Method, str] = {
     "grid": "pixel grid",
@@ -205,7 +204,7 @@ class Panel(StepPanel):
         what, name = self._get_shape()
         mesh = what in ("mesh", "merged-mesh")
         self._mesh.draw(mesh and bool(name), what == "merged-mesh")
-        self._shape_format.offer([(each, FORMAT_NAMES[each]) for each in FORMATS[what]])
+        self._shape_format.offer([(each, FORMAT_NAMES.get(each, each.upper())) for each in formats(what)])
         change(self._texture, visible=bool(name) and mesh and self._shape_format.value in TEXTURED_FORMATS)
         change(self._white, visible=self._texture.visible and TEXTURES[self._texture.value] is not None)
         if name:
@@ -228,7 +227,7 @@ class Panel(StepPanel):
             self._shape_link.set("")
             self._shape_result.write("")
         numbers: What = self._numbers.value or "calibration"  # type: ignore[assignment]
-        self._number_format.offer([(each, FORMAT_NAMES[each]) for each in FORMATS[numbers]])
+        self._number_format.offer([(each, FORMAT_NAMES[each]) for each in formats(numbers)])
         chosen = self._number_format.value
         self._number_note.write(f"{NUMBERS[numbers][1]}. {describe_format(chosen)}.", "dim")
         file = _get_export(session, default_file_name(numbers, "", chosen))
@@ -369,5 +368,5 @@ def _button_colour(file: ExportView | None) -> Literal["gray"] | None:
 
 def _rank_export(export: ExportView) -> tuple[int, str]:
     """Return a sort key: merged clouds, then other shapes, then documents."""
-    shaped = Path(export.name).suffix.removeprefix(".").lower() in _SHAPED
+    shaped = Path(export.name).suffix.removeprefix(".").lower() in {*point_formats(), *mesh_formats()}
     return (0 if export.name.startswith("merged") else 1 if shaped else 2, export.name)

@@ -10,10 +10,10 @@ from slviewer.gui.panel import StepPanel
 from slviewer.gui.preview import board_html, draw_preview, exposure_html, legend
 from slviewer.gui.widgets import Html, Picture, Text, alert, coloured, link, paragraph, to_html
 from slviewer.pipeline.printouts import target as write_target
-from slviewer.target.board import EXAMPLES, Board, Kind
+from slviewer.target.board import EXAMPLES, Board, board_examples, plugin_boards
 from slviewer.wizard.snapshot import PreviewView, Snapshot
 
-KINDS: dict[str, Kind] = {
+KINDS = {
     "Circle grid": "circles",
     "Asymmetric circle grid": "acircles",
     "Chessboard": "chessboard",
@@ -40,7 +40,8 @@ class Panel(StepPanel):
         """Create the fields of the board, and the live image."""
         gui, context = self._gui, self._context
         board = Board.parse(EXAMPLES["circles"])
-        self._kind = gui.add_dropdown("Board", tuple(KINDS))
+        self._kinds = KINDS | {added.what: name for name, added in plugin_boards().items()}
+        self._kind = gui.add_dropdown("Board", tuple(self._kinds))
         self._columns = gui.add_number("Columns", board.columns, min=2, max=200, step=1)
         self._rows = gui.add_number("Rows", board.rows, min=3, max=200, step=1)
         self._pitch = gui.add_number("Pitch, mm", float(board.pitch_mm), min=0.1, max=1000.0, step=0.01)
@@ -66,7 +67,12 @@ class Panel(StepPanel):
             self._sheet.set("")
         if target != self._target:
             self._target = target
-            self._board = Board.parse(target) if target else None
+            try:
+                self._board = Board.parse(target) if target else None
+            except InputError as error:  # of a plugin that is not installed here
+                self._board = None
+                self._note.set(alert(str(error), "error"))
+                return
             if self._board is not None:
                 self._fill_fields(self._board)
         self._describe()
@@ -78,14 +84,14 @@ class Panel(StepPanel):
 
     def _parse_entered(self) -> Board:
         """Return the board that the fields describe. Raises InputError for an invalid one."""
-        kind = KINDS[self._kind.value]
+        kind = self._kinds[self._kind.value]
         notation = f"{kind}:{int(self._columns.value)}x{int(self._rows.value)}:{self._pitch.value:g}"
         markers = f":{self._marker.value:g}:{self._dictionary.value}" if kind == "charuco" else ""
         return Board.parse(notation + markers)
 
     def _fill_fields(self, board: Board) -> None:
         """Fill the fields from a board."""
-        change(self._kind, value=next(label for label, kind in KINDS.items() if kind == board.kind))
+        change(self._kind, value=next(label for label, kind in self._kinds.items() if kind == board.kind))
         change(self._columns, value=board.columns)
         change(self._rows, value=board.rows)
         change(self._pitch, value=float(board.pitch_mm))
@@ -98,7 +104,7 @@ class Panel(StepPanel):
 
     def _change_kind(self) -> None:
         """Fill the fields with an example of the chosen kind of board."""
-        self._fill_fields(Board.parse(EXAMPLES[KINDS[self._kind.value]]))
+        self._fill_fields(Board.parse(board_examples()[self._kinds[self._kind.value]]))
         self._describe()
 
     def _describe(self) -> None:
@@ -110,7 +116,9 @@ class Panel(StepPanel):
             return
         corners = board.outline()
         width, height = corners[2, 0] - corners[0, 0], corners[2, 1] - corners[0, 1]
-        explanation = coloured(f"{_EXPLANATIONS[board.kind]}. Size: {width:.0f} × {height:.0f} mm", "dim")
+        added = board.plugin_type
+        counts = added.counts if added else _EXPLANATIONS[board.kind]
+        explanation = coloured(f"{counts}. Size: {width:.0f} × {height:.0f} mm", "dim")
         in_use = str(board) == self._target
         change(self._use, disabled=in_use)
         state = coloured(

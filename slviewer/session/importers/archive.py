@@ -13,7 +13,7 @@ from slviewer.errors import InputError
 from slviewer.session.atomic import format_bytes
 from slviewer.session.importers.images import IMAGE_SUFFIXES
 from slviewer.session.importers.imported import listed, visible
-from slviewer.session.importers.layouts import LAYOUTS
+from slviewer.session.importers.layouts import layouts
 
 MOST_BYTES = 20 * 10**9
 """Unpacked; a hundred poses of 50 frames of 4 MB."""
@@ -92,7 +92,7 @@ def _select_members(zipped: zipfile.ZipFile) -> tuple[list[zipfile.ZipInfo], lis
 
 def _innermost_folder(folder: Path) -> Path:
     """Return the folder itself, or the inner one that alone holds everything, as in a zip of a folder."""
-    while not any(layout.is_capture(folder) for layout in LAYOUTS.values()):
+    while not any(layout.is_capture(folder) for layout in layouts().values()):
         inside = visible(folder)
         if len(inside) != 1 or not inside[0].is_dir():
             break

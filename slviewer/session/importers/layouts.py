@@ -1,13 +1,14 @@
-"""The layouts that can be imported, by name, and which of them a folder has."""
+"""The layouts that can be imported, by name, and which of them a folder has. Plugins add others."""
 
 from pathlib import Path
 
+from slviewer.entry_points import IMPORTERS, usable_plugins
 from slviewer.errors import InputError
 from slviewer.session.importers import frames, opencv_graycode, p18, procam_calibration, slstudio, sltk
 from slviewer.session.importers.imported import FolderLayout, visible
 from slviewer.session.reading import expand_user
 
-LAYOUTS = {
+BUILT_IN = {
     layout.name: layout
     for layout in (
         p18.LAYOUT,
@@ -18,6 +19,11 @@ LAYOUTS = {
         FolderLayout("frames", "images and a TOML that describes them", frames.read, lambda folder: False),
     )
 }
+
+
+def layouts() -> dict[str, FolderLayout]:
+    """Return all layouts by name, those of plugins last."""
+    return BUILT_IN | usable_plugins(IMPORTERS, FolderLayout, frozenset(BUILT_IN))
 
 
 def detect_layout(source: Path) -> str:
@@ -31,14 +37,14 @@ def detect_layout(source: Path) -> str:
     if find_description(source) is not None:
         return "frames"
     folders = [source, *(entry for entry in visible(source) if entry.is_dir())]
-    candidates = [name for name, layout in LAYOUTS.items() if any(layout.is_capture(folder) for folder in folders)]
+    candidates = [name for name, layout in layouts().items() if any(layout.is_capture(folder) for folder in folders)]
     if len(candidates) == 1:
         return candidates[0]
     if candidates:
         raise InputError(
             f"{source} holds captures of {' and '.join(candidates)}: name the layout, or import one at a time"
         )
-    known = "; ".join(f"{layout.name}: {layout.holds}" for layout in LAYOUTS.values())
+    known = "; ".join(f"{layout.name}: {layout.holds}" for layout in layouts().values())
     raise InputError(f"{source} has none of the known layouts ({known}): describe the images in a TOML in the folder")
 
 

@@ -1,0 +1,1 @@
+"""Plugins for slviewer, one a file."""

@@ -1,0 +1,216 @@
+"""Tests of plugins: does a device, an importer, a board or an exporter keep what slviewer relies on?
+
+Each function returns one line per fault, an empty list where there is none, so that a package's test reads
+``assert check_camera(MyCamera()) == []``.
+"""
+
+import shutil
+import tempfile
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from slviewer.devices.protocols import Camera, CameraSettings, Projector, Turntable
+from slviewer.errors import Cancelled, DetectionError, DeviceError, InputError, SlviewerError
+from slviewer.fringe.presets import complementary, phase_steps
+from slviewer.fringe.sequence import Frame, PatternSequence
+from slviewer.session.importers.imported import FolderLayout
+from slviewer.session.mesh_files import Exporter
+from slviewer.surface.shapes import Mesh, PointSet
+from slviewer.target.board import Board
+from slviewer.target.detect import detect
+
+_SEEN_LEVEL, _OTHER_LEVEL = 85, 170
+"""With which the buffers are filled before two grabs."""
+_ANGLE_TOLERANCE_DEG = 0.5
+
+
+def check_camera(camera: Camera) -> list[str]:
+    """List what a closed camera does against the protocol `Camera`. It is opened, grabs some frames, and is closed."""
+    faults = _check_size(camera)
+    if np.dtype(camera.dtype) not in (np.uint8, np.uint16):
+        return [*faults, f"dtype is {camera.dtype}: it must be uint8 or uint16"]
+    width, height = camera.size
+    frame = np.zeros((height, width), camera.dtype)
+    faults += _check_opening(camera, lambda: camera.grab(frame))
+    camera.open()
+    try:
+        frames = [np.full((height, width), level, camera.dtype) for level in (_SEEN_LEVEL, _OTHER_LEVEL)]
+        for each in frames:
+            camera.grab(each)
+        untouched = (frames[0] == _SEEN_LEVEL) & (frames[1] == _OTHER_LEVEL)
+        if np.count_nonzero(untouched) > frame.size // 1000:  # some may have these levels in truth
+            faults.append(f"grab left {np.count_nonzero(untouched)} of {frame.size} pixels as they were: fill them all")
+        wrong = np.zeros((height + 1, width), camera.dtype)
+        faults += _expect(InputError, lambda: camera.grab(wrong), "grab into an array of another shape")
+        other = np.zeros((height, width), np.float32)
+        faults += _expect(InputError, lambda: camera.grab(other), "grab into an array of another type")
+        for name, call in (("settings", camera.settings), ("apply", lambda: camera.apply(CameraSettings()))):
+            if not isinstance(call(), CameraSettings):
+                faults.append(f"{name} does not return CameraSettings")
+        exposure = camera.settings().exposure_ms
+        applied = camera.apply(CameraSettings(exposure_ms=exposure)).exposure_ms
+        if exposure is not None and (applied is None or not np.isclose(applied, exposure, rtol=0.05)):
+            faults.append(f"apply of the present exposure, {exposure:g} ms, leaves {applied} ms")
+    finally:
+        camera.close()
+    return faults
+
+
+def check_projector(projector: Projector) -> list[str]:
+    """List what a closed projector does against the protocol `Projector`. It is opened, shows a sequence, and is
+    closed."""
+    faults = _check_size(projector)
+    faults += _check_opening(projector, lambda: projector.show_level(0))
+    projector.open()
+    try:
+        faults += _expect(DeviceError, lambda: projector.show(0), "show before load")
+        width, height = projector.size
+        frames = (Frame("white"), Frame("black"), *phase_steps("x", 3, 16.0), *phase_steps("y", 3, 16.0))
+        other = PatternSequence((width + 1, height), frames)
+        faults += _expect(InputError, lambda: projector.load(other), "load of patterns of another size")
+        for sequence in (complementary((width, height)), PatternSequence((width, height), frames)):
+            projector.load(sequence)
+            for index in (0, len(sequence.frames) - 1):
+                projector.show(index)
+        for index in (-1, len(frames)):
+            faults += _expect(InputError, partial(projector.show, index), f"show of frame {index}")
+        for level in (0, 128, 255, None):
+            projector.show_level(level)
+        for level in (-1, 256):
+            faults += _expect(InputError, partial(projector.show_level, level), f"show_level of {level}")
+        faults += _expect(None, lambda: projector.show(0), "show after show_level, where the sequence stays loaded,")
+    finally:
+        projector.close()
+    return faults
+
+
+def check_turntable(turntable: Turntable, turn_deg: float = 5.0) -> list[str]:
+    """List what a closed turntable does against the protocol `Turntable`. It turns by an angle and back."""
+    faults = [] if turntable.name else ["name is empty"]
+    faults += _check_opening(turntable, turntable.position_deg)
+    turntable.open()
+    try:
+        start = turntable.position_deg()
+        limits = turntable.limits_deg
+        to = start - turn_deg if limits is not None and start + turn_deg > limits[1] else start + turn_deg
+        for angle in (to, start):
+            turntable.turn_to(angle)
+            if abs(turntable.position_deg() - angle) > _ANGLE_TOLERANCE_DEG:
+                faults.append(f"after turn_to({angle:g}) it stands at {turntable.position_deg():g} degrees")
+        if limits is not None:
+            faults += _expect(InputError, lambda: turntable.turn_to(limits[1] + 1), "turn_to beyond the limits")
+
+        def cancel() -> None:
+            raise Cancelled("cancelled")
+
+        faults += _expect(Cancelled, lambda: turntable.turn_to(to, cancel), "turn_to with a check that raises")
+        turntable.turn_to(start)
+    finally:
+        turntable.close()
+    return faults
+
+
+def check_importer(layout: FolderLayout, capture: Path, **options: Any) -> list[str]:
+    """List what a layout does wrong with a folder that holds one capture; ``options`` are those of its ``read``.
+
+    A copy of the folder without its first image, and an empty folder, must be refused or skipped with a reason.
+    """
+    if not layout.is_capture(capture):
+        return [f"is_capture is False for {capture}"]
+    imports = layout.read(capture, **options)
+    faults = [] if len(imports) == 1 else [f"read finds {len(imports)} captures in {capture}, which is one"]
+    for recording, new in zip(imports.recordings, imports, strict=True):
+        expected = len(recording.sequence.frames) * max(1, len(recording.exposures_ms))
+        if len(new.frames) != expected:
+            faults.append(f"{recording.name}: {len(new.frames)} images for {expected} frames")
+    with tempfile.TemporaryDirectory() as folder:
+        empty = Path(folder) / "empty"
+        empty.mkdir()
+        if layout.is_capture(empty):
+            faults.append("is_capture is True for an empty folder")
+        faults += _expect(InputError, lambda: layout.read(empty, **options), "read of an empty folder")
+        shorter = Path(folder) / "captures" / capture.name
+        shutil.copytree(capture, shorter)
+        missing = imports.recordings[0].files[0].resolve().relative_to(capture.resolve())
+        (shorter / missing).unlink()
+        try:
+            incomplete = layout.read(shorter.parent, **options)
+        except InputError:
+            pass
+        else:
+            if len(incomplete):
+                faults.append(f"a capture without {missing} is read as if it were complete")
+    return faults
+
+
+def check_board(notation: str) -> list[str]:
+    """List what is wrong with the board of an installed plugin, by a notation such as its example."""
+    board = Board.parse(notation)
+    faults = [] if Board.parse(str(board)) == board else [f"{board} is another board than {notation}"]
+    points = board.points
+    if len(np.unique(np.round(points, 6), axis=0)) != len(points):
+        faults.append("some features have the same coordinates")
+    for level in (0, 128, 255):
+        blank = np.full((480, 640), level, np.uint8)
+        faults += _expect(DetectionError, partial(detect, board, blank), "detection in an empty image")
+    return faults
+
+
+def check_exporter(exporter: Exporter) -> list[str]:
+    """List what is wrong with a file format: it must encode small shapes with and without normals and colours."""
+    rng = np.random.default_rng(0)
+    points = rng.normal(0, 10, (4, 3)).astype(np.float32)
+    normals = np.tile(np.array([0, 0, 1], np.float32), (4, 1))
+    colours = rng.integers(0, 255, (4, 3)).astype(np.uint8)
+    faces = np.array([[0, 1, 2], [1, 2, 3]], np.int32)
+    faults = [] if exporter.name == exporter.name.lower() and exporter.name.isalnum() else ["name is no plain suffix"]
+    shapes: list[PointSet | Mesh] = []
+    if exporter.takes_points:
+        shapes += [PointSet(points), PointSet(points, normals=normals, colours=colours)]
+    if exporter.takes_meshes:
+        shapes += [Mesh(points, faces), Mesh(points, faces, normals=normals, colours=colours)]
+    if not shapes:
+        faults.append("it takes neither points nor meshes")
+    for shape in shapes:
+        content = exporter.encode(shape, {"sigma": np.full(4, 0.01, np.float32)}, ("a note",))
+        if not isinstance(content, bytes) or not content:
+            faults.append(f"encode of a {type(shape).__name__} does not return bytes")
+    return faults
+
+
+def _check_size(device: Camera | Projector) -> list[str]:
+    """List what is wrong with the name and the size of a closed device."""
+    faults = [] if isinstance(device.name, str) and device.name else ["name is empty"]
+    size = device.size
+    if len(size) != 2 or not all(isinstance(side, int) and side > 0 for side in size):
+        faults.append(f"size is {size!r}: it must be (width, height) px as two int")
+    return faults
+
+
+def _check_opening(device: Camera | Projector | Turntable, use: Callable[[], object]) -> list[str]:
+    """List faults of `open` and `close`: using a closed device is an error, closing it twice and reopening are not."""
+    faults = _expect(DeviceError, use, "use before open")
+    faults += _expect(None, device.close, "close before open")
+    device.open()
+    try:
+        faults += _expect(DeviceError, device.open, "a second open")
+    finally:
+        device.close()
+    faults += _expect(None, device.close, "a second close")
+    return faults + _expect(DeviceError, use, "use after close")
+
+
+def _expect(error: type[SlviewerError] | None, call: Callable[[], object], what: str) -> list[str]:
+    """Return a fault unless the call raises the error, or with None nothing."""
+    try:
+        call()
+    except Exception as raised:
+        if error is not None and isinstance(raised, error):
+            return []
+        wanted = "nothing" if error is None else error.__name__
+        return [f"{what} raises {type(raised).__name__} ({raised}), not {wanted}"]
+    return [] if error is None else [f"{what} raises nothing: it must raise {error.__name__}"]
