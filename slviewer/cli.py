@@ -74,6 +74,9 @@ COMMANDS = Commands(
             read_command, "pipeline.capture:capture", "session", "name", options=[*PAGES], run=run_capture
         ),
         "turn": partial(read_command, "pipeline.turn:turn", "session", options=[*PAGES, JSON], run=run_turn),
+        "plan-rig": partial(
+            read_command, "pipeline.plan_rig:plan_rig", "camera", "projector", "distance", options=[JSON]
+        ),
         "import": make_import_command,
         "calibrate": partial(
             read_command, "pipeline.calibrate:calibrate", "session", options=CALIBRATED, run=run_calibrate

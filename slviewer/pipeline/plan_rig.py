@@ -1,0 +1,261 @@
+"""Plan a rig: what a camera and a projector will measure at a distance, from their data sheets."""
+
+import re
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+
+from slviewer.calibration.stereo import StereoModel
+from slviewer.errors import InputError
+from slviewer.evaluation.plane import evaluate_plane
+from slviewer.evaluation.rig_plan import DARK_LEVEL, PEAK_LEVEL, PlannedCamera, PlannedLight, PlannedProjector, RigPlan
+from slviewer.evaluation.rig_plan import plan_rig as predict_rig
+from slviewer.fringe.decode import decode
+from slviewer.fringe.presets import complementary
+from slviewer.fringe.sequence import one_axis
+from slviewer.pipeline.feedback import Progress, ignore_progress
+from slviewer.reconstruction.reconstruct import reconstruct
+from slviewer.simulation.assets import asset
+from slviewer.simulation.boards import Pose, blank_board
+from slviewer.simulation.lens import SimulatedLens
+from slviewer.simulation.renderer import Renderer
+from slviewer.simulation.rig import Illumination, Sensor, SimulatedRig
+
+ANGLE_DEG = 22.0
+"""Between both axes, where no baseline is given."""
+_VIEW = re.compile(r"(\d+)x(\d+):(\d+(?:\.\d+)?)(mm|deg)?")
+_MIN_COVERAGE = 0.8
+_ANGLES_DEG = 12.0, 35.0
+"""Angles beyond which a baseline is named as too short or too long."""
+_CHECKED_PX = 500_000
+"""So many camera pixels are simulated."""
+
+
+@dataclass(frozen=True)
+class PlannedRig:
+    """A prediction, and with a check ``measured``, the RMS in mm of a simulated plane in the middle of the view, and
+    ``expected``, the prediction for that part."""
+
+    camera: str
+    projector: str
+    plan: RigPlan
+    light: PlannedLight
+    measured: float | None = None
+    expected: float | None = None
+
+    def text(self) -> str:
+        """Return the plan as lines of text with units and advice."""
+        plan = self.plan
+        lines = [
+            f"camera     {self.camera}",
+            f"projector  {self.projector}",
+            f"distance   {plan.distance:.0f} mm, baseline {plan.baseline:.0f} mm, angle {plan.angle_deg:.0f} degrees",
+            "",
+            f"camera sees          {_size(plan.camera_field)} mm, {plan.camera_px:.3f} mm a pixel",
+            f"projector lights     {_size(plan.projector_field)} mm, {plan.projector_px:.3f} mm a column",
+            f"coverage             {100 * plan.coverage:.0f} % of the camera's view",
+            f"depth range          {plan.depth_range[0]:.0f} to {plan.depth_range[1]:.0f} mm",
+            f"fringe period        {plan.period_px:.0f} columns, {plan.period_px * plan.projector_px:.1f} mm; "
+            f"modulation {plan.modulation:.0f} grey levels",
+            f"noise of a point     {_sigma(plan.sigma_middle)} in the middle, {_sigma(plan.sigma_corner)} at the "
+            f"border ({self.light.steps} steps, one sigma, of depth)",
+        ]
+        if self.measured is not None and self.expected is not None:
+            lines.append(
+                f"simulated            {_sigma(self.measured)} RMS from a plane in the middle, predicted "
+                f"{_sigma(self.expected)}"
+            )
+        return "\n".join([*lines, *(f"! {advice}" for advice in self.advice())])
+
+    def advice(self) -> list[str]:
+        """Return what to change, a sentence each."""
+        plan, found = self.plan, []
+        ratio = plan.camera_px / plan.projector_px
+        if plan.coverage < _MIN_COVERAGE:
+            wide = plan.projector_field[0] < plan.camera_field[0] or plan.projector_field[1] < plan.camera_field[1]
+            change = "a longer lens for the camera, or a greater throw" if wide else "a shorter baseline"
+            found.append(f"the projector lights {100 * plan.coverage:.0f} % of what the camera sees: choose {change}")
+        if ratio > 1.5:
+            found.append(
+                f"a camera pixel covers {ratio:.1f} projector columns: choose a longer lens or more camera pixels"
+            )
+        if plan.angle_deg < _ANGLES_DEG[0]:
+            found.append(f"the angle of {plan.angle_deg:.0f} degrees is small: a longer baseline lowers the noise")
+        if plan.angle_deg > _ANGLES_DEG[1]:
+            found.append(f"the angle of {plan.angle_deg:.0f} degrees is large: much of a part will be hidden from one")
+        if plan.modulation < 20:
+            found.append(
+                f"a modulation of {plan.modulation:.0f} grey levels is weak: expose longer, or darken the room"
+            )
+        return found
+
+
+def plan_rig(
+    camera: str,
+    projector: str,
+    distance: float,
+    *,
+    baseline: float | None = None,
+    lens: float | None = None,
+    steps: int = 8,
+    period: float | None = None,
+    reflectance: float = 1.0,
+    ambient: float = 0.06,
+    check: bool = False,
+    progress: Progress = ignore_progress,
+) -> PlannedRig:
+    """Predict field, depth range, fringe period and noise of a camera and a projector before they are mounted.
+
+    The noise is that of a single point; errors of the calibration are not included.
+
+    Args:
+        camera: webcam-1080p, global-shutter-2mp, machine-vision-5mp, or its size and width of view: 1920x1080:70deg.
+        projector: pocket-720p, projector-1080p, lightcrafter4500, or its size and throw ratio: 1920x1080:1.4.
+        distance: Working distance from the camera, mm.
+        baseline: Between camera and projector, mm; by default for an angle of 22 degrees.
+        lens: Focal length of the camera's lens, mm, for a camera whose pixel size is known.
+        steps: Phase steps.
+        period: Fringe period in projector columns, by default the one with the least noise.
+        reflectance: Of the object; 1 is white paper, to which the exposure is set.
+        ambient: Room light as a share of the projector's.
+        check: Measure a plane with this rig in the simulation, whose lenses and light are other code.
+
+    Raises InputError for unknown devices and impossible figures.
+    """
+    for name, value, low, high in (
+        ("distance", distance, 10, 1e5), ("steps", steps, 3, 64), ("reflectance", reflectance, 0.01, 1),
+        ("ambient", ambient, 0, 5), ("period", 16 if period is None else period, 3, 1000),
+    ):  # fmt: skip
+        if not low <= value <= high:
+            raise InputError(f"{name} = {value:g} is impossible: give {low:g} to {high:g}")
+    planned_camera, camera_text = _read_camera(camera, lens)
+    planned_projector, projector_text = _read_projector(projector)
+    between = distance * np.tan(np.radians(ANGLE_DEG)) if baseline is None else baseline
+    if not 1 <= between <= 3 * distance:
+        raise InputError(
+            f"a baseline of {between:g} mm is impossible at {distance:g} mm: give 1 to {3 * distance:g} mm"
+        )
+    light = PlannedLight(steps, reflectance, ambient)
+    plan = predict_rig(planned_camera, planned_projector, distance, float(between), light, period)
+    planned = PlannedRig(camera_text, projector_text, plan, light)
+    if not check:
+        return planned
+    progress(0.05, "simulating the rig before a plane")
+    measured, expected = _simulate_plane(planned_camera, planned_projector, plan, light)
+    return PlannedRig(camera_text, projector_text, plan, light, measured, expected)
+
+
+def _simulate_plane(
+    camera: PlannedCamera, projector: PlannedProjector, plan: RigPlan, light: PlannedLight
+) -> tuple[float, float]:
+    """Return the RMS in mm of a plane that the simulated rig captured, in the middle of the camera's view, with the
+    true calibration; and the one predicted."""
+    rig = plan.rig
+    share = min(1.0, np.sqrt(_CHECKED_PX / np.prod(camera.size)))
+    size = (int(camera.size[0] * share) // 2 * 2, int(camera.size[1] * share) // 2 * 2)
+    fx, fy = projector.focal_px
+    ideal = (0.0,) * 5
+    column, row = rig.projector.K[:2, 2].tolist()
+    focus = float(rig.to_projector(np.array([0.0, 0.0, plan.distance]))[2])
+    peak = DARK_LEVEL + (PEAK_LEVEL - DARK_LEVEL) * light.reflectance  # the renderer exposes for what it sees
+    simulated = SimulatedRig(
+        SimulatedLens(size, (camera.focal_px,) * 2, ((size[0] - 1) / 2, (size[1] - 1) / 2), ideal),
+        SimulatedLens(projector.size, (fx, fy), (column, row), ideal),
+        np.array(rig.R),
+        np.array(rig.t),
+        Sensor(camera.blur_px, DARK_LEVEL, camera.read_variance, camera.shot_variance, peak),
+        Illumination(
+            light.ambient, projector.black, 1.0, 0.0, projector.blur_px, focus, fx * projector.aperture_mm / 4
+        ),
+    )
+    plate = blank_board(Pose(np.eye(3), np.array([0.0, 0.0, plan.distance])), (4 * plan.camera_field[0],) * 2)
+    sequence = one_axis(complementary(projector.size, light.steps, plan.period_px), "x")
+    phase = decode(sequence, Renderer(simulated, plate).capture(sequence), "x")
+    K = rig.camera.K.copy()
+    K[:2, 2] = (size[0] - 1) / 2, (size[1] - 1) / 2
+    model = StereoModel.from_rig(type(rig)(type(rig.camera)(K, np.zeros(5), size), rig.projector, rig.R, rig.t))
+    cloud = reconstruct(model, {"x": phase}, "x")
+    cut = replace(camera, size=size)
+    expected = predict_rig(cut, projector, plan.distance, plan.baseline, light, plan.period_px).sigma_rms
+    return float(evaluate_plane(cloud.points, np.isfinite(cloud.points[..., 2])).rms_mm), expected
+
+
+def _read_camera(text: str, lens: float | None) -> tuple[PlannedCamera, str]:
+    """Return a camera by its name, or by size and angle of view, and its description."""
+    known = _read_devices("camera")
+    if view := _VIEW.fullmatch(text):
+        entry: Mapping[str, Any] = known["global-shutter-2mp"] | {
+            "size": [int(view[1]), int(view[2])],
+            "view_deg": float(view[3]),
+            "what": f"{text}, noise as 2 Mpx machine vision",
+        }
+        if view[4] == "mm":
+            raise InputError(f"camera {text}: give the angle of view as 70deg, or a known camera with --lens")
+        entry = {key: value for key, value in entry.items() if key not in ("pixel_um", "lens_mm")}
+    elif text in known:
+        entry = known[text]
+    else:
+        raise InputError(
+            f"no camera is called {text!r}: use {', '.join(known)}, or size and angle of view as in 1920x1080:70deg"
+        )
+    width = entry["size"][0]
+    if "pixel_um" in entry:
+        millimetres = entry["lens_mm"] if lens is None else lens
+        if not 1 <= millimetres <= 1000:
+            raise InputError(f"a lens of {millimetres:g} mm is impossible: give 1 to 1000 mm")
+        focal, aperture = millimetres * 1000 / entry["pixel_um"], millimetres / entry["f_number"]
+        described = f"{entry['what']}, lens {millimetres:g} mm at f/{entry['f_number']:g}"
+    elif lens is not None:
+        raise InputError("the lens of this camera is given by its angle of view: omit --lens, or name another camera")
+    else:
+        focal = width / 2 / np.tan(np.radians(entry["view_deg"]) / 2)
+        aperture, described = entry.get("aperture_mm", 3.0), entry["what"]
+    size = (int(width), int(entry["size"][1]))
+    camera = PlannedCamera(size, focal, aperture, entry["blur_px"], entry["full_well"], entry["read_noise"])
+    return camera, described
+
+
+def _read_projector(text: str) -> tuple[PlannedProjector, str]:
+    """Return a projector by its name, or by size and throw ratio, and its description."""
+    known = _read_devices("projector")
+    if view := _VIEW.fullmatch(text):
+        entry: Mapping[str, Any] = known["projector-1080p"] | {
+            "size": [int(view[1]), int(view[2])],
+            "throw_ratio": float(view[3]),
+            "what": f"{text}, as a common projector",
+        }
+    elif text in known:
+        entry = known[text]
+    else:
+        raise InputError(
+            f"no projector is called {text!r}: use {', '.join(known)}, or size and throw ratio as in 1920x1080:1.4"
+        )
+    columns, rows = (int(n) for n in entry["size"])
+    fx = columns * entry["throw_ratio"]
+    if not 0.1 <= entry["throw_ratio"] <= 20:
+        raise InputError(
+            f"a throw ratio of {entry['throw_ratio']:g} is impossible: give distance over width, 0.1 to 20"
+        )
+    focal = (fx, fx / entry.get("row_pitch", 1.0))
+    return PlannedProjector(
+        (columns, rows), focal, entry["offset"], entry["aperture_mm"], entry["blur_px"], entry["black"]
+    ), entry["what"]
+
+
+def _read_devices(kind: Literal["camera", "projector"]) -> dict[str, dict[str, Any]]:
+    """Return the typical devices of a kind by name."""
+    devices: dict[str, dict[str, Any]] = tomllib.loads(asset("planning/devices.toml").read_text(encoding="utf-8"))[kind]
+    return devices
+
+
+def _size(field: tuple[float, float]) -> str:
+    """Return a width and height in mm as text."""
+    return f"{field[0]:.0f} x {field[1]:.0f}"
+
+
+def _sigma(millimetres: float) -> str:
+    """Return a small length in µm or mm."""
+    return f"{1000 * millimetres:.0f} µm" if millimetres < 0.9995 else f"{millimetres:.2f} mm"

@@ -1,0 +1,94 @@
+"""A planned rig: its prediction agrees with the simulation, and with what optics says."""
+
+import json
+
+import numpy as np
+import pytest
+
+from slviewer.cli import main
+from slviewer.errors import InputError
+from slviewer.evaluation.rig_plan import plan_rig as predict
+from slviewer.pipeline.plan_rig import _read_camera, _read_projector, plan_rig
+
+pytestmark = pytest.mark.slow
+
+BUDGETS = (
+    ("webcam-1080p", "pocket-720p", 500.0),
+    ("global-shutter-2mp", "projector-1080p", 600.0),
+    ("machine-vision-5mp", "lightcrafter4500", 600.0),
+)
+
+
+@pytest.mark.parametrize(("camera", "projector", "distance"), BUDGETS)
+@pytest.mark.parametrize(
+    "how", [{}, {"steps": 4, "reflectance": 0.3}, {"period": 24.0, "baseline": 100.0, "ambient": 0.4}], ids=str
+)
+def test_the_simulation_measures_what_is_predicted(camera, projector, distance, how):
+    planned = plan_rig(camera, projector, distance, check=True, **how)
+    assert planned.measured == pytest.approx(planned.expected, rel=0.15)
+    assert 0.002 < planned.expected < 1.0
+    assert "simulated" in planned.text()
+
+
+def test_noise_follows_baseline_distance_and_steps():
+    def sigma(**how):
+        distance = how.pop("distance", 600.0)
+        return plan_rig("global-shutter-2mp", "projector-1080p", distance, **how).plan.sigma_middle
+
+    assert sigma(baseline=60, period=16) / sigma(baseline=120, period=16) == pytest.approx(2, rel=0.05)
+    assert sigma(steps=4) / sigma(steps=16) == pytest.approx(2, rel=1e-6)
+    # of similar triangles every length grows with the distance, and so does the error; the blur of a pupil does not
+    assert sigma(distance=1200, baseline=400) / sigma(baseline=200) == pytest.approx(2, rel=0.06)
+
+
+def test_the_recommended_period_has_the_least_noise():
+    # a period that neither the camera's pixels nor the grey levels limit
+    camera, _ = _read_camera("machine-vision-5mp", 25.0)
+    projector, _ = _read_projector("projector-1080p")
+    blurred = type(projector)(**{**vars(projector), "blur_px": 2.0})
+    best = predict(camera, blurred, 600.0, 240.0).period_px
+    sigmas = {p: predict(camera, blurred, 600.0, 240.0, period_px=p).sigma_middle for p in np.arange(8.0, 26.0)}
+    assert 10 < best < 20 and abs(min(sigmas, key=sigmas.__getitem__) - best) <= 1
+
+
+def test_fields_follow_the_lens_and_the_throw():
+    plan = plan_rig("1600x1200:60deg", "1000x500:2", 500.0, baseline=1.0).plan
+    assert plan.camera_field[0] == pytest.approx(2 * 500 * np.tan(np.radians(30)), rel=1e-6)
+    assert plan.projector_field == pytest.approx((250, 125), rel=1e-4)
+    assert plan.camera_px == pytest.approx(plan.camera_field[0] / 1600)
+    assert plan.coverage == pytest.approx(250 * 125 / np.prod(plan.camera_field), rel=0.05)
+    wide, narrow = (plan_rig("global-shutter-2mp", "projector-1080p", 600.0, lens=f).plan for f in (8.0, 16.0))
+    assert wide.camera_field[0] == pytest.approx(2 * narrow.camera_field[0])
+
+
+def test_advice_names_what_is_wrong():
+    planned = plan_rig("webcam-1080p", "lightcrafter4500", 500.0, baseline=50.0, reflectance=0.1)
+    advice = " ".join(planned.advice())
+    assert f"{100 * planned.plan.coverage:.0f} %" in advice and "baseline" in advice and "modulation" in advice
+    assert plan_rig("global-shutter-2mp", "projector-1080p", 600.0).advice() == []
+
+
+@pytest.mark.parametrize(
+    ("camera", "projector", "distance", "how"),
+    [
+        ("a-camera", "pocket-720p", 500, {}),
+        ("webcam-1080p", "1x1", 500, {}),
+        ("webcam-1080p", "pocket-720p", -5, {}),
+        ("webcam-1080p", "pocket-720p", 500, {"lens": 8.0}),
+        ("webcam-1080p", "pocket-720p", 500, {"baseline": 5000.0}),
+        ("webcam-1080p", "pocket-720p", 500, {"steps": 2}),
+        ("100x100:179.99", "100x100:20", 500, {"baseline": 1490.0}),
+    ],
+)
+def test_impossible_plans_are_refused(camera, projector, distance, how):
+    with pytest.raises(InputError):
+        plan_rig(camera, projector, distance, **how)
+
+
+def test_the_command_prints_the_plan_and_json(capsys, tmp_path):
+    assert main(["plan-rig", "webcam-1080p", "pocket-720p", "500"]) == 0
+    printed = capsys.readouterr()
+    assert "noise of a point" in printed.out + printed.err
+    result = tmp_path / "plan.json"
+    assert main(["plan-rig", "webcam-1080p", "pocket-720p", "500", "--json", str(result)]) == 0
+    assert 0.01 < json.loads(result.read_text())["plan"]["sigma_middle"] < 0.1
