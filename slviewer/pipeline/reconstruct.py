@@ -128,6 +128,12 @@ def reconstruct(
 
     ``check``: also compare the frames with each other, and warn of those that do not fit.
     """
+    for path, suffix in ((out, ".ply"), (grid, ".npy")):
+        if path is not None and Path(path).suffix.lower() != suffix:
+            raise InputError(
+                f"{path}: a cloud is written as .ply (--out), its whole grid as .npy (--grid): end its name in "
+                f"{suffix}; `slviewer export` writes other formats"
+            )
     with opened(session) as store:
         check_accepted(store, accept_rejected)
         name = model or preferred_model(store)
