@@ -45,6 +45,7 @@ if TYPE_CHECKING:
     from slviewer.fringe.phase import PhaseMap
     from slviewer.fringe.presets import complementary, gray, micro, multifrequency, p18
     from slviewer.fringe.sequence import Frame, PatternSequence
+    from slviewer.inspection.quantities import Quantity
     from slviewer.pipeline import datasets
     from slviewer.pipeline.calibrate import CalibrationResult, calibrate, calibrate_frames, save_calibration
     from slviewer.pipeline.import_captures import import_captures, read_captures
@@ -53,11 +54,12 @@ if TYPE_CHECKING:
     from slviewer.pipeline.mesh import mesh
     from slviewer.pipeline.models import load_calibration
     from slviewer.pipeline.reconstruct import reconstruct
-    from slviewer.pipeline.verify import verify
+    from slviewer.pipeline.verify import Verification, verify
     from slviewer.reconstruction.cloud import Cloud
     from slviewer.reconstruction.reconstruct import reconstruct as reconstruct_cloud
     from slviewer.registration.multiway import register_all as align_clouds
     from slviewer.report.maps import error_maps as draw_error_maps
+    from slviewer.session.measurements import Measurement
     from slviewer.session.ply import write_ply
     from slviewer.session.store import Session
     from slviewer.surface.fuse import fuse as fuse_clouds
@@ -75,10 +77,13 @@ _EXPORTS = {
     "CalibrationResult": "pipeline.calibrate",
     "Cloud": "reconstruction.cloud",
     "Frame": "fringe.sequence",
+    "Measurement": "session.measurements",
     "PatternSequence": "fringe.sequence",
     "PhaseMap": "fringe.phase",
+    "Quantity": "inspection.quantities",
     "Session": "session.store",
     "SlviewerError": "errors",
+    "Verification": "pipeline.verify",
     "align_clouds": "registration.multiway:register_all",
     "calibrate": "pipeline.calibrate",
     "calibrate_frames": "pipeline.calibrate",
@@ -113,7 +118,8 @@ _EXPORTS = {
 """{public name: module}, or module:name where it has another name there, or module:* for the module itself."""
 
 __all__ = [
-    "Board", "CalibrationResult", "Cloud", "Frame", "PatternSequence", "PhaseMap", "Session", "SlviewerError",
+    "Board", "CalibrationResult", "Cloud", "Frame", "Measurement", "PatternSequence", "PhaseMap", "Quantity",
+    "Session", "SlviewerError", "Verification",
     "align_clouds", "calibrate", "calibrate_frames", "check_description", "complementary", "datasets", "decode",
     "detect_board", "draw_error_maps", "evaluate_plane", "evaluate_sphere", "fuse_clouds", "gray", "import_captures",
     "load_calibration", "measure", "merge", "mesh", "mesh_cloud", "micro", "multifrequency", "p18", "plugins",

@@ -47,4 +47,8 @@ def run_calibrate(calibrate: Callable[..., Any], arguments: dict[str, Any]) -> N
         compared = call(validate, session=arguments["session"], models=arguments["models"])
         data["validation"] = compared.to_json()
         terminal.print_result(compared.text())
+    if not camera_only:
+        from slviewer.pipeline.models import describe_default_model
+
+        terminal.print_result(describe_default_model(arguments["session"]))
     write_json(json_file, data)

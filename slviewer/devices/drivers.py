@@ -44,6 +44,7 @@ class Driver:
         )
 
 
+@cache
 def drivers() -> dict[str, Driver]:
     """Return all drivers by name, usable here or not; those of plugins last."""
     built_in = builtin_drivers()

@@ -42,6 +42,7 @@ class GenicamCamera(Openable):
     ) -> None:
         super().__init__(f"the camera {camera}")
         self.size, self.dtype, self.pixels = size, pixels.dtype, pixels
+        self.full_scale = 2**pixels.bits - 1
         self._camera, self._trigger, self._line, self._first = camera, trigger, line, first
         self._link: Link | None = None
         self._timeout_s = _ANSWER_TIMEOUT_S

@@ -12,6 +12,7 @@ from typing import Literal, Protocol, runtime_checkable
 import numpy as np
 
 from slviewer.errors import DeviceError, InputError
+from slviewer.fringe.layout import clip_level
 from slviewer.fringe.sequence import PatternSequence
 
 
@@ -33,7 +34,11 @@ class CameraSettings:
 
 
 class Camera(Protocol):
-    """Grabs single frames on request; `name`, `size` and `dtype` can be read before it is open."""
+    """Grabs single frames on request; `name`, `size` and `dtype` can be read before it is open.
+
+    One of more than 8 bits may also have a `full_scale`, the grey level at which it clips, such as 4095; without it the
+    bit depth is taken from the brightest pixel, and a dark image may pass for a bright one of fewer bits.
+    """
 
     @property
     def name(self) -> str:
@@ -78,6 +83,11 @@ class ColourCamera(Camera, Protocol):
     def grab_colour(self) -> np.ndarray:
         """Grab a new (h, w, 3) RGB frame of `dtype`, exposed as `grab` requires."""
         ...
+
+
+def find_full_scale(camera: Camera, largest: int) -> float:
+    """Return the grey level at which a camera clips: its own statement, else by the largest level of an image."""
+    return float(getattr(camera, "full_scale", None) or clip_level(camera.dtype, largest))
 
 
 _MAX_ANGLE_DEG = 1e5

@@ -7,7 +7,6 @@ import numpy as np
 from slviewer.inspection.features import Feature
 from slviewer.inspection.quantities import Quantity
 from slviewer.inspection.section import CutPlane
-from slviewer.pipeline.measurements import quantities_of
 from slviewer.records import from_plain
 from slviewer.session.measurements import Measurement
 
@@ -35,7 +34,7 @@ def label(measured: Measurement) -> str:
     """Return a measurement's label in 3D: the name, and the first quantity."""
     if measured.kind in ("point", "section", "deviation"):
         return measured.name
-    first = quantities_of(measured)[0]
+    first = measured.quantities[0]
     named = "" if measured.kind in ("distance", "relation") else f"{first.name} "
     return f"{measured.name}: {named}{format_quantity(first)}" + (" (stale)" if measured.stale else "")
 

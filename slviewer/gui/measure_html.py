@@ -10,7 +10,6 @@ from slviewer.gui.pictures import PLOT_PX
 from slviewer.gui.widgets import Html, Tone, alert, colour_bar, coloured, paragraph, table, to_html
 from slviewer.inspection.colours import deviation_colours
 from slviewer.inspection.tolerance import DECIDED
-from slviewer.pipeline.measurements import quantities_of
 from slviewer.report.canvas import finish_figure, new_figure, style_axes
 from slviewer.report.measurements import draw_deviations
 from slviewer.report.page import Figure
@@ -31,7 +30,7 @@ def measurements_table(measured: Sequence[Measurement], chosen: str, labels: Map
         name = coloured(each.name, "warning" if each.stale else "plain", bold=each.id == chosen)
         on = labels.get(each.source, each.source)
         about = coloured(f"{each.kind} on {on}" + (", stale" if each.stale else ""), "warning" if each.stale else "dim")
-        for i, quantity in enumerate(quantities_of(each)[: _HEADLINES.get(each.kind, 2)]):
+        for i, quantity in enumerate(each.quantities[: _HEADLINES.get(each.kind, 2)]):
             rows.append((Html(f"{name}<br>{about}") if i == 0 else "", quantity.name, format_quantity(quantity)))
     return Html(table(("Result", "", "Value"), rows) + _format_notes(measured))
 
@@ -39,7 +38,7 @@ def measurements_table(measured: Sequence[Measurement], chosen: str, labels: Map
 def measurement_html(measured: Measurement, labels: Mapping[str, str]) -> Html:
     """Return all quantities of one measurement, with its source and warnings."""
     on = labels.get(measured.source, measured.source)
-    rows = [(quantity.name, format_quantity(quantity)) for quantity in quantities_of(measured)]
+    rows = [(quantity.name, format_quantity(quantity)) for quantity in measured.quantities]
     about = f"{measured.kind} on {on}, by {measured.model}"
     if where := measured.data.get("where"):
         about += f"; {where}"
@@ -97,7 +96,7 @@ def deviation_figure(name: str, edges: np.ndarray, counts: np.ndarray, limit: fl
 
 def _format_notes(measured: Sequence[Measurement]) -> str:
     """Return a note on the uncertainties of the measurements; empty where none is known."""
-    known = [quantity for each in measured for quantity in quantities_of(each) if quantity.U is not None]
+    known = [quantity for each in measured for quantity in each.quantities if quantity.U is not None]
     if not known:
         return ""
     return paragraph(

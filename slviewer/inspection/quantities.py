@@ -9,8 +9,9 @@ COVERAGE = 2.0
 
 @dataclass(frozen=True)
 class Quantity:
-    """``sigma``: its standard uncertainty, None where it has none (a residual, a count); ``whole``: whether that holds
-    the calibration's part, which only some models know."""
+    """A measured value. ``sigma``: its standard uncertainty (k = 1) in ``unit``, None where it has none (a residual, a
+    count); ``U``: the expanded one (k = 2). ``whole``: whether they hold the calibration's part, which only the splined
+    model knows; without it they are too small."""
 
     name: str
     value: float
@@ -29,4 +30,5 @@ class Quantity:
         unit = {"deg": "°", "%": " %", "": ""}.get(self.unit, f" {self.unit}")
         if self.U is None:
             return f"{self.name} {self.value:.{digits}f}{unit}"
-        return f"{self.name} {self.value:.{digits}f} ± {self.U:.{digits}f}{unit} (k = 2)"
+        part = "" if self.whole else ", without the calibration's part"
+        return f"{self.name} {self.value:.{digits}f} ± {self.U:.{digits}f}{unit} (k = 2{part})"

@@ -36,7 +36,6 @@ from slviewer.pipeline.measurements import (
     add_relation,
     add_section,
     load_measurements,
-    quantities_of,
 )
 from slviewer.pipeline.models import MODELS, available_models, load_model, load_stereo_if_complete
 from slviewer.pipeline.open_session import SessionLike, numbered_results, opened
@@ -223,8 +222,8 @@ def _verification_figures(models: Mapping[str, Mapping[str, Any]]) -> dict[str, 
 
 def _measurement_figures(measured: Measurement) -> dict[str, float]:
     """Return a measurement's values and uncertainties."""
-    values = {f"{q.name}, {q.unit}": q.value for q in quantities_of(measured)}
-    return values | {f"U of {q.name}, {q.unit}": q.U for q in quantities_of(measured) if q.U is not None}
+    values = {f"{q.name}, {q.unit}": q.value for q in measured.quantities}
+    return values | {f"U of {q.name}, {q.unit}": q.U for q in measured.quantities if q.U is not None}
 
 
 def _check_page(page: str, certificate: Certificate) -> Check:

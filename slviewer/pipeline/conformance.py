@@ -6,7 +6,7 @@ Each function returns one line per fault, an empty list where there is none, so 
 
 import shutil
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -30,9 +30,15 @@ _ANGLE_TOLERANCE_DEG = 0.5
 
 def check_camera(camera: Camera) -> list[str]:
     """List what a closed camera does against the protocol `Camera`. It is opened, grabs some frames, and is closed."""
-    faults = _check_size(camera)
-    if np.dtype(camera.dtype) not in (np.uint8, np.uint16):
-        return [*faults, f"dtype is {camera.dtype}: it must be uint8 or uint16"]
+    return _collect(_inspect_camera, camera)
+
+
+def _inspect_camera(faults: list[str], camera: Camera) -> None:
+    """Append the faults."""
+    faults += _check_size(camera)
+    if not isinstance(camera.dtype, np.dtype) or camera.dtype not in (np.uint8, np.uint16):
+        faults.append(f"dtype is {camera.dtype!r}: it must be np.dtype(np.uint8) or np.dtype(np.uint16)")
+        return
     width, height = camera.size
     frame = np.zeros((height, width), camera.dtype)
     faults += _check_opening(camera, lambda: camera.grab(frame))
@@ -53,17 +59,23 @@ def check_camera(camera: Camera) -> list[str]:
                 faults.append(f"{name} does not return CameraSettings")
         exposure = camera.settings().exposure_ms
         applied = camera.apply(CameraSettings(exposure_ms=exposure)).exposure_ms
+        if applied != camera.settings().exposure_ms:
+            faults.append(f"apply returns {applied} ms, and settings {camera.settings().exposure_ms} ms after it")
         if exposure is not None and (applied is None or not np.isclose(applied, exposure, rtol=0.05)):
             faults.append(f"apply of the present exposure, {exposure:g} ms, leaves {applied} ms")
     finally:
         camera.close()
-    return faults
 
 
 def check_projector(projector: Projector) -> list[str]:
     """List what a closed projector does against the protocol `Projector`. It is opened, shows a sequence, and is
     closed."""
-    faults = _check_size(projector)
+    return _collect(_inspect_projector, projector)
+
+
+def _inspect_projector(faults: list[str], projector: Projector) -> None:
+    """Append the faults."""
+    faults += _check_size(projector)
     faults += _check_opening(projector, lambda: projector.show_level(0))
     projector.open()
     try:
@@ -85,12 +97,16 @@ def check_projector(projector: Projector) -> list[str]:
         faults += _expect(None, lambda: projector.show(0), "show after show_level, where the sequence stays loaded,")
     finally:
         projector.close()
-    return faults
 
 
 def check_turntable(turntable: Turntable, turn_deg: float = 5.0) -> list[str]:
     """List what a closed turntable does against the protocol `Turntable`. It turns by an angle and back."""
-    faults = [] if turntable.name else ["name is empty"]
+    return _collect(_inspect_turntable, turntable, turn_deg)
+
+
+def _inspect_turntable(faults: list[str], turntable: Turntable, turn_deg: float) -> None:
+    """Append the faults."""
+    faults += [] if turntable.name else ["name is empty"]
     faults += _check_opening(turntable, turntable.position_deg)
     turntable.open()
     try:
@@ -111,7 +127,6 @@ def check_turntable(turntable: Turntable, turn_deg: float = 5.0) -> list[str]:
         turntable.turn_to(start)
     finally:
         turntable.close()
-    return faults
 
 
 def check_importer(layout: FolderLayout, capture: Path, **options: Any) -> list[str]:
@@ -119,10 +134,16 @@ def check_importer(layout: FolderLayout, capture: Path, **options: Any) -> list[
 
     A copy of the folder without its first image, and an empty folder, must be refused or skipped with a reason.
     """
+    return _collect(_inspect_importer, layout, capture, options)
+
+
+def _inspect_importer(faults: list[str], layout: FolderLayout, capture: Path, options: Mapping[str, Any]) -> None:
+    """Append the faults."""
     if not layout.is_capture(capture):
-        return [f"is_capture is False for {capture}"]
+        faults.append(f"is_capture is False for {capture}")
+        return
     imports = layout.read(capture, **options)
-    faults = [] if len(imports) == 1 else [f"read finds {len(imports)} captures in {capture}, which is one"]
+    faults += [] if len(imports) == 1 else [f"read finds {len(imports)} captures in {capture}, which is one"]
     for recording, new in zip(imports.recordings, imports, strict=True):
         expected = len(recording.sequence.frames) * max(1, len(recording.exposures_ms))
         if len(new.frames) != expected:
@@ -144,30 +165,38 @@ def check_importer(layout: FolderLayout, capture: Path, **options: Any) -> list[
         else:
             if len(incomplete):
                 faults.append(f"a capture without {missing} is read as if it were complete")
-    return faults
 
 
 def check_board(notation: str) -> list[str]:
     """List what is wrong with the board of an installed plugin, by a notation such as its example."""
+    return _collect(_inspect_board, notation)
+
+
+def _inspect_board(faults: list[str], notation: str) -> None:
+    """Append the faults."""
     board = Board.parse(notation)
-    faults = [] if Board.parse(str(board)) == board else [f"{board} is another board than {notation}"]
+    faults += [] if Board.parse(str(board)) == board else [f"{board} is another board than {notation}"]
     points = board.points
     if len(np.unique(np.round(points, 6), axis=0)) != len(points):
         faults.append("some features have the same coordinates")
     for level in (0, 128, 255):
         blank = np.full((480, 640), level, np.uint8)
         faults += _expect(DetectionError, partial(detect, board, blank), "detection in an empty image")
-    return faults
 
 
 def check_exporter(exporter: Exporter) -> list[str]:
     """List what is wrong with a file format: it must encode small shapes with and without normals and colours."""
+    return _collect(_inspect_exporter, exporter)
+
+
+def _inspect_exporter(faults: list[str], exporter: Exporter) -> None:
+    """Append the faults."""
     rng = np.random.default_rng(0)
     points = rng.normal(0, 10, (4, 3)).astype(np.float32)
     normals = np.tile(np.array([0, 0, 1], np.float32), (4, 1))
     colours = rng.integers(0, 255, (4, 3)).astype(np.uint8)
     faces = np.array([[0, 1, 2], [1, 2, 3]], np.int32)
-    faults = [] if exporter.name == exporter.name.lower() and exporter.name.isalnum() else ["name is no plain suffix"]
+    faults += [] if exporter.name == exporter.name.lower() and exporter.name.isalnum() else ["name is no plain suffix"]
     shapes: list[PointSet | Mesh] = []
     if exporter.takes_points:
         shapes += [PointSet(points), PointSet(points, normals=normals, colours=colours)]
@@ -179,6 +208,15 @@ def check_exporter(exporter: Exporter) -> list[str]:
         content = exporter.encode(shape, {"sigma": np.full(4, 0.01, np.float32)}, ("a note",))
         if not isinstance(content, bytes) or not content:
             faults.append(f"encode of a {type(shape).__name__} does not return bytes")
+
+
+def _collect(inspect: Callable[..., None], *arguments: Any) -> list[str]:
+    """Return the faults that an inspection appends, and the exception that ends it early, if one does."""
+    faults: list[str] = []
+    try:
+        inspect(faults, *arguments)
+    except Exception as error:  # whatever a plugin raises is a fault of it
+        faults.append(f"the check ended early with {type(error).__name__}: {error}")
     return faults
 
 

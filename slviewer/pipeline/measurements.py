@@ -170,15 +170,10 @@ def relabel_measurement(session: SessionLike, identity: str, name: str) -> Measu
         return rename_measurement(store, identity, name)
 
 
-def quantities_of(measured: Measurement) -> list[Quantity]:
-    """Return the quantities of a measurement with units and uncertainties."""
-    return from_plain(measured.data["quantities"], list[Quantity])
-
-
 def describe_measurement(measured: Measurement) -> str:
     """A measurement as one line of text."""
     mark = "  [stale: measured on what has since changed]" if measured.stale else ""
-    read = "; ".join(quantity.text() for quantity in quantities_of(measured))
+    read = "; ".join(quantity.text() for quantity in measured.quantities)
     return f"{measured.id:<4} {measured.name} ({measured.kind} on {measured.source}): {read}{mark}"
 
 
@@ -186,7 +181,7 @@ def measurements_csv(session: SessionLike) -> str:
     """All measurements as comma-separated values, one row a quantity; U where it is known."""
     rows: list[Iterable[object]] = [COLUMNS]
     for each in load_measurements(session):
-        for q in quantities_of(each):
+        for q in each.quantities:
             U = "" if q.U is None else f"{q.U:.6g}"
             whole = "" if q.U is None else ("yes" if q.whole else "no")
             state = "stale" if each.stale else "fresh"

@@ -223,6 +223,23 @@ def recommended_model(store: Session) -> str:
     return there[0]
 
 
+def describe_default_model(session: SessionLike) -> str:
+    """Which calibration commands use unless they name one, and why, as a line of text."""
+    with opened(session) as store:
+        name = preferred_model(store)
+        compared = load_validation(store)
+        fitted = [each for each in available_models(store) if each != "stereo"]
+        if name == store.decision("model"):
+            why = "chosen by the operator"
+        elif compared is not None and compared.recommended == name:
+            why = "recommended by the comparison on held-out poses"
+        elif name == "stereo" and fitted:
+            why = f"{' and '.join(fitted)} from fewer than {POSES_FOR_PIXELWISE} poses are used only by --model"
+        else:
+            why = f"made from {POSES_FOR_PIXELWISE} poses or more" if fitted else "the only one"
+    return f"default model: {name} ({why})"
+
+
 def load_validation(store: Session) -> CrossValidation | None:
     """How the session's calibrations compare on poses that they were not made from; None where they were not compared
     them as they are now."""

@@ -12,7 +12,7 @@ from slviewer.inspection.quantities import Quantity
 from slviewer.inspection.regions import Region
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
 from slviewer.pipeline.measured_surface import load_surface
-from slviewer.pipeline.measurements import load_feature, load_measurements, quantities_of
+from slviewer.pipeline.measurements import load_feature, load_measurements
 from slviewer.pipeline.open_session import SessionLike, opened
 from slviewer.pipeline.part_inspection import fit_to_nominal
 from slviewer.records import from_plain
@@ -100,7 +100,7 @@ def make_plan(
     listed = [_plan_feature(names[i], each, features[i], T) for i, each in fits.items()]
     characteristics: list[Characteristic] = []
     for i, each in fits.items():
-        for quantity in quantities_of(each):
+        for quantity in each.quantities:
             if quantity.name == "diameter":
                 characteristics.append(_around(f"{names[i]} diameter", quantity, (names[i],), tolerance))
         kind = FORM_OF[each.kind]
@@ -108,7 +108,7 @@ def make_plan(
     for each in measured.values():
         if each.kind == "relation" and not each.stale and all(i in fits for i in each.of):
             pair = tuple(names[i] for i in each.of)
-            for quantity in quantities_of(each):
+            for quantity in each.quantities:
                 if quantity.name in KINDS:
                     title = f"{pair[0]} – {pair[1]} {quantity.name}"
                     characteristics.append(_around(title, quantity, pair, tolerance))

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slviewer.devices.capture import settle
-from slviewer.devices.protocols import CameraSettings, Rig
+from slviewer.devices.protocols import CameraSettings, Rig, find_full_scale
 from slviewer.errors import DeviceError, InputError
-from slviewer.fringe.layout import Layout, axis_layout, white_level
+from slviewer.fringe.layout import Layout, axis_layout
 from slviewer.fringe.limits import DARK_LEVELS
 from slviewer.fringe.reference import dark_sigmas, phase_shift
 from slviewer.fringe.sequence import PatternSequence
@@ -208,7 +208,7 @@ class _Bracket:
     @property
     def _full(self) -> float:
         """Grey level at which the camera clips."""
-        return white_level(np.array([[[self._largest]]], self._frame.dtype), [0])
+        return find_full_scale(self._rig.camera, self._largest)
 
     @property
     def _clip(self) -> float:

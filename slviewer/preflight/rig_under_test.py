@@ -6,8 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from slviewer.devices.protocols import Rig
-from slviewer.fringe.layout import white_level
+from slviewer.devices.protocols import Rig, find_full_scale
 
 _PIXELS = 150_000
 """So many pixels of an image are looked at."""
@@ -105,8 +104,7 @@ class RigUnderTest:
     @property
     def full(self) -> float:
         """The grey level at which the camera clips."""
-        references = np.stack([self.white, self.dark]).astype(self._frame.dtype)
-        return white_level(references, [0, 1])
+        return find_full_scale(self.rig.camera, int(max(self.white.max(), self.dark.max())))
 
     @property
     def contrast(self) -> float:

@@ -3,11 +3,14 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from slviewer.errors import InputError
+from slviewer.inspection.quantities import Quantity
+from slviewer.records import from_plain
 from slviewer.session.names import clean_label, natural_key
 from slviewer.session.store import Session
 
@@ -31,6 +34,18 @@ class Measurement:
     data: dict[str, Any]
     of: tuple[str, ...] = ()
     stale: bool = False
+
+    @cached_property
+    def quantities(self) -> list[Quantity]:
+        """The measured values, the most important first, such as the radius and the diameter of a sphere."""
+        return from_plain(self.data["quantities"], list[Quantity])
+
+    def __getitem__(self, name: str) -> Quantity:
+        """Return the quantity of that name, such as "diameter". Raises InputError for others."""
+        for quantity in self.quantities:
+            if quantity.name == name:
+                return quantity
+        raise InputError(f"{self.name} has no {name!r}: it has {', '.join(each.name for each in self.quantities)}")
 
 
 def save_measurement(

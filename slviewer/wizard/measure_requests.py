@@ -244,7 +244,7 @@ def _reword_errors() -> Iterator[None]:
 
 def describe_measurement(measured: Measurement) -> str:
     """Describe a measurement in one sentence: its name and quantities."""
-    values = "; ".join(quantity.text() for quantity in measurements.quantities_of(measured))
+    values = "; ".join(quantity.text() for quantity in measured.quantities)
     return f"{measured.name}: {values}"
 
 

@@ -26,7 +26,6 @@ from slviewer.gui.steps.scan import painting, point_html, sort_scans, uncertaint
 from slviewer.gui.steps.verify import distances_table, results_table, shape_of
 from slviewer.gui.widgets import colour_range, report_table
 from slviewer.pipeline.calibration_verdict import save_verdict
-from slviewer.pipeline.measurements import quantities_of
 from slviewer.report.data import SpacingRow, VerificationView
 from slviewer.report.quality import comparison_table
 from slviewer.server.secure import Serving
@@ -256,8 +255,8 @@ def test_a_part_is_measured_and_compared_with_its_nominal(
     click_until(page, (480, 440), "Click the second point.")
     page.mouse.click(590, 420)
     width = came(operator, 1)
-    assert width.kind == "distance" and 5 < quantities_of(width)[0].value < 140
-    expect(page.get_by_text(re.compile(rf"{quantities_of(width)[0].value:.3f} ±\s0\.\d+\smm")).first).to_be_visible()
+    assert width.kind == "distance" and 5 < width.quantities[0].value < 140
+    expect(page.get_by_text(re.compile(rf"{width.quantities[0].value:.3f} ±\s0\.\d+\smm")).first).to_be_visible()
 
     tool(page, "Section", "Click the start of the section.")
     click_until(page, (480, 440), "Click the end of the section")
@@ -270,7 +269,7 @@ def test_a_part_is_measured_and_compared_with_its_nominal(
     tool(page, "Sphere", "Click the centre of the sphere.")
     click_until(page, (540, 400), "points in the ball")
     click(page, "Fit sphere")
-    radius = quantities_of(came(operator, 3))[0]
+    radius = came(operator, 3).quantities[0]
     assert radius.U is not None and abs(radius.value - 98.0) < max(2 * radius.U, 0.1)  # the simulated sphere's, mm
     field(page, "New name").fill("Ball <i>")
     page.get_by_role("button", name="Rename", exact=True).click()

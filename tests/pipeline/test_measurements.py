@@ -104,13 +104,13 @@ def test_what_is_measured_is_kept_listed_and_true(folder, balls, run: Run, tmp_p
     point = measurements.add_point(folder, balls, a)
     over = measurements.add_relation(folder, point.id, first.id)
 
-    radius = measurements.quantities_of(first)[0]
+    radius = first.quantities[0]
     assert abs(radius.value - RADIUS) < max(3 * radius.sigma, 0.02) and 0 < radius.sigma < 0.1 and not radius.whole
     true = np.linalg.norm(CENTRES[1] - CENTRES[0])
-    distance = measurements.quantities_of(apart)[0]
+    distance = apart.quantities[0]
     assert abs(distance.value - true) < max(3 * distance.sigma, 0.02) and apart.of == (first.id, second.id)
-    assert abs(measurements.quantities_of(width)[0].value - true) < 3 and measurements.quantities_of(width)[0].sigma > 0
-    assert abs(measurements.quantities_of(over)[1].value) < 0.3  # the point lies on the ball's surface
+    assert abs(width.quantities[0].value - true) < 3 and width.quantities[0].sigma > 0
+    assert abs(over.quantities[1].value) < 0.3  # the point lies on the ball's surface
     plane, lines = measurements.section_lines(folder, cut.id)
     assert len(lines) >= 2 and max(np.ptp(line[:, 0]) for line in lines) < 2 * RADIUS
     assert np.allclose(plane.drawn(balls.points[a[1], a[0]][None].astype(float)), 0, atol=1e-3)
@@ -249,8 +249,8 @@ def test_a_merge_is_measured_on_too(folder, balls, regions) -> None:
     on = load_surface(folder, "merge/1")
     region = regions[0]
     one = measurements.add_fit(folder, on, "sphere", ball_about(balls, region))
-    assert abs(measurements.quantities_of(one)[0].value - RADIUS) < 0.05 and one.source == "merge/1"
-    assert measurements.quantities_of(measurements.add_distance(folder, on, 0, 5))[0].sigma > 0
+    assert abs(one.quantities[0].value - RADIUS) < 0.05 and one.source == "merge/1"
+    assert measurements.add_distance(folder, on, 0, 5).quantities[0].sigma > 0
     ends = [
         int(np.argmin(np.linalg.norm(on.points - c - [dx, 0, -20.0], axis=1))) for c in CENTRES[:1] for dx in (-15, 15)
     ]

@@ -13,7 +13,6 @@ from scipy.spatial import cKDTree
 from slviewer.calibration.guidance import pose_selection
 from slviewer.calibration.splined import fields
 from slviewer.errors import Cancelled
-from slviewer.pipeline.measurements import quantities_of
 from slviewer.session.ply import read_ply
 from slviewer.session.store import Session
 from slviewer.wizard import acquisition, result_views, tasks
@@ -77,9 +76,9 @@ def test_the_flight_reaches_a_merged_ply(operator: Operator, acts: list[str]) ->
     assert len(merged.points) == merge.points > 30_000
     assert next(scan.label for scan in session.scans if scan.purpose == "scan") == "Ammonite, near"
     sphere, width = session.measurements
-    radius = quantities_of(sphere)[0]
+    radius = sphere.quantities[0]
     assert radius.U is not None and abs(radius.value - 98) < 2 * radius.U < 0.2  # the simulated sphere's
-    assert 130 < quantities_of(width)[0].value < 150  # the ammonite's
+    assert 130 < width.quantities[0].value < 150  # the ammonite's
 
 
 def test_poses_are_asked_for_until_the_wanted_sigma_is_reached(operator: Operator) -> None:

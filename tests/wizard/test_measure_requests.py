@@ -18,7 +18,6 @@ from slviewer.pipeline.measurements import (
     add_point,
     add_section,
     load_measurements,
-    quantities_of,
 )
 from slviewer.pipeline.models import save_imported_stereo
 from slviewer.session.inspection_plan import read_plan
@@ -89,10 +88,10 @@ def test_what_is_clicked_is_measured_and_true(operator: Operator) -> None:
     left, right, width, cut, point = now(operator).measurements
     assert operator.measure_between(left.id, right.id)
     apart = now(operator).measurements[-1]
-    radius, true = quantities_of(left)[0], float(np.linalg.norm(CENTRES[1] - CENTRES[0]))
+    radius, true = left.quantities[0], float(np.linalg.norm(CENTRES[1] - CENTRES[0]))
     assert abs(radius.value - RADIUS) < max(3 * (radius.sigma or 0), 0.05)
-    assert quantities_of(apart)[0].value == pytest.approx(true, abs=0.1)
-    assert quantities_of(width)[0].value == pytest.approx(true, abs=2.0)
+    assert apart.quantities[0].value == pytest.approx(true, abs=0.1)
+    assert width.quantities[0].value == pytest.approx(true, abs=2.0)
     assert [each.kind for each in (cut, point, apart)] == ["section", "point", "relation"]
     assert operator.snapshot().step("measure").state == "done"
 

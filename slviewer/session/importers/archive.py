@@ -92,7 +92,7 @@ def _select_members(zipped: zipfile.ZipFile) -> tuple[list[zipfile.ZipInfo], lis
 
 def _innermost_folder(folder: Path) -> Path:
     """Return the folder itself, or the inner one that alone holds everything, as in a zip of a folder."""
-    while not any(layout.is_capture(folder) for layout in layouts().values()):
+    while not any(layout.recognises(folder) for layout in layouts().values()):
         inside = visible(folder)
         if len(inside) != 1 or not inside[0].is_dir():
             break

@@ -81,6 +81,13 @@ class FolderLayout:
     is_capture: Callable[[Path], bool]
     projector: tuple[int, int] | None = None
 
+    def recognises(self, folder: Path) -> bool:
+        """Whether `is_capture` is true; False where it fails, so that one layout does not hide the others."""
+        try:
+            return bool(self.is_capture(folder))
+        except Exception:  # whatever a plugin raises; `check_importer` shows it to its author
+            return False
+
 
 def define_layout(
     name: str,
@@ -136,8 +143,10 @@ def check_complete(images: Mapping[tuple[int, ...], Path], stem: str, count: int
 
 
 def has_images(folder: Path, pattern: re.Pattern[str]) -> bool:
-    """Whether a folder contains images whose stem matches the pattern."""
-    return any(pattern.fullmatch(entry.stem) and entry.suffix.lower() in IMAGE_SUFFIXES for entry in visible(folder))
+    """Whether a folder exists and contains images whose stem matches the pattern."""
+    return folder.is_dir() and any(
+        pattern.fullmatch(entry.stem) and entry.suffix.lower() in IMAGE_SUFFIXES for entry in visible(folder)
+    )
 
 
 def collect_captures(
@@ -160,6 +169,9 @@ def collect_captures(
             recording, more = describe(folder, capture_name(folder, prefix))
         except InputError as error:
             skipped.append(Skipped(folder.name, str(error)))
+        except Exception as error:  # a plugin's own fault
+            fault = f"its layout failed, {type(error).__name__}: {error}; report it to the layout's maker"
+            skipped.append(Skipped(folder.name, fault))
         else:
             recordings.append(recording)
             warnings += more

@@ -37,7 +37,7 @@ def detect_layout(source: Path) -> str:
     if find_description(source) is not None:
         return "frames"
     folders = [source, *(entry for entry in visible(source) if entry.is_dir())]
-    candidates = [name for name, layout in layouts().items() if any(layout.is_capture(folder) for folder in folders)]
+    candidates = [name for name, layout in layouts().items() if any(layout.recognises(folder) for folder in folders)]
     if len(candidates) == 1:
         return candidates[0]
     if candidates:

@@ -1,0 +1,174 @@
+"""The checks for plugins accept the drivers that come with slviewer, and name what a bad one does."""
+
+import re
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from slviewer.devices.opening import Openable
+from slviewer.devices.protocols import CameraSettings, check_frame
+from slviewer.devices.simulated import SimulatedTurntable, simulated_rig
+from slviewer.devices.world import SimulatedWorld
+from slviewer.fringe.presets import phase_steps
+from slviewer.fringe.sequence import PatternSequence
+from slviewer.pipeline.conformance import (
+    check_board,
+    check_camera,
+    check_exporter,
+    check_importer,
+    check_projector,
+    check_turntable,
+)
+from slviewer.session.importers.imported import ImportableRecording, define_layout, has_images, match_images
+from slviewer.session.importers.layouts import detect_layout, layouts
+from slviewer.session.mesh_files import Exporter
+from slviewer.simulation.rig import letter
+from slviewer.target.board import EXAMPLES
+
+PATTERN = re.compile(r"shot(\d+)")
+
+
+class Camera(Openable):
+    """A camera that keeps the protocol, for the bad ones to differ from."""
+
+    size, dtype = (64, 48), np.dtype(np.uint8)
+
+    def __init__(self) -> None:
+        super().__init__("a camera")
+
+    def grab(self, out: np.ndarray) -> None:
+        self.check_open()
+        check_frame(self, out)
+        out[:] = 99
+
+    def settings(self) -> CameraSettings:
+        return CameraSettings(10.0, 1.0)
+
+    def apply(self, settings: CameraSettings) -> CameraSettings:
+        return self.settings()
+
+
+class LeavesARow(Camera):
+    def grab(self, out: np.ndarray) -> None:
+        self.check_open()
+        check_frame(self, out)
+        out[:-1] = 99
+
+
+class TakesAnyArray(Camera):
+    def grab(self, out: np.ndarray) -> None:
+        self.check_open()
+        out[:] = 99
+
+
+class NeverClosed(Camera):
+    def grab(self, out: np.ndarray) -> None:
+        check_frame(self, out)
+        out[:] = 99
+
+
+class CloseRaises(Camera):
+    def close(self) -> None:
+        raise RuntimeError("the library is gone")
+
+
+class AppliesNothing(Camera):
+    def apply(self, settings: CameraSettings) -> None:  # type: ignore[override]
+        return None
+
+
+class Nameless(Camera):
+    dtype = "uint16"
+
+    def __init__(self) -> None:
+        Openable.__init__(self, "")
+
+
+def test_a_good_camera_has_no_fault():
+    assert check_camera(Camera()) == []
+    rig = simulated_rig(SimulatedWorld(letter(0.1)))
+    assert check_camera(rig.camera) == [] and check_projector(rig.projector) == []
+    assert check_turntable(SimulatedTurntable(SimulatedWorld(letter(0.1)))) == []
+
+
+@pytest.mark.parametrize(
+    ("camera", "named"),
+    [
+        (LeavesARow(), "64 of 3072 pixels"),
+        (TakesAnyArray(), "another shape"),
+        (NeverClosed(), "use before open raises nothing"),
+        (CloseRaises(), "the library is gone"),
+        (AppliesNothing(), "apply does not return CameraSettings"),
+        (Nameless(), "name is empty"),
+        (Nameless(), "dtype is 'uint16'"),
+    ],
+)
+def test_the_faults_of_a_bad_camera_are_listed(camera, named):
+    assert any(named in fault for fault in check_camera(camera))
+
+
+def layout(describe=None, is_capture=None):
+    def good(folder, name, projector):
+        images, _ = match_images(folder, PATTERN)
+        frames = tuple(phase_steps("x", 3, 30))
+        return ImportableRecording(name, PatternSequence(projector, frames), tuple(images.values()), folder), []
+
+    return define_layout(
+        "shots", "images", describe or good, is_capture or (lambda f: has_images(f, PATTERN)), (90, 60)
+    )
+
+
+@pytest.fixture
+def capture(tmp_path: Path) -> Path:
+    folder = tmp_path / "one"
+    folder.mkdir()
+    for k in range(3):
+        cv2.imwrite(str(folder / f"shot{k}.png"), np.full((48, 64), 50 * k, np.uint8))
+    return folder
+
+
+def test_an_importer_that_reads_incomplete_captures_is_named(capture):
+    assert any("as if it were complete" in fault for fault in check_importer(layout(), capture))
+
+
+def fails(*_):
+    raise KeyError("oops")
+
+
+@pytest.mark.parametrize(("parts", "named"), [({"describe": fails}, "oops"), ({"is_capture": fails}, "oops")])
+def test_an_importer_that_raises_is_named(capture, parts, named):
+    assert any(named in fault for fault in check_importer(layout(**parts), capture))
+
+
+def test_a_layout_that_fails_hides_no_other(capture, monkeypatch):
+    broken = layout(is_capture=fails)
+    assert not broken.recognises(capture) and not has_images(capture / "missing", PATTERN)
+    monkeypatch.setattr("slviewer.session.importers.layouts.layouts", lambda: {"broken": broken, "shots": layout()})
+    assert detect_layout(capture) == "shots"
+    assert "p18" in layouts()
+
+
+def test_a_capture_that_its_layout_cannot_describe_is_skipped_with_the_reason(capture):
+    def half(folder, name, projector):
+        if folder.name == "two":
+            raise KeyError("oops")
+        images, _ = match_images(folder, PATTERN)
+        frames = tuple(phase_steps("x", 3, 30))
+        return ImportableRecording(name, PatternSequence(projector, frames), tuple(images.values()), folder), []
+
+    (capture.parent / "two").mkdir()
+    (capture.parent / "two" / "shot0.png").write_bytes((capture / "shot0.png").read_bytes())
+    imports = layout(half).read(capture.parent)
+    assert [recording.name for recording in imports.recordings] == ["one"]
+    assert "oops" in str(imports.skipped[0]) and "two" in str(imports.skipped[0])
+
+
+def test_boards_and_exporters():
+    for notation in EXAMPLES.values():
+        assert check_board(notation) == []
+    assert check_exporter(Exporter("pts", "points", lambda shape, scalars, notes: b"1")) == []
+    named = check_exporter(Exporter("PTS", "points", lambda shape, scalars, notes: "1"))  # type: ignore[arg-type,return-value]
+    assert len(named) == 3
+    assert check_exporter(Exporter("pts", "nothing", fails, takes_points=False))
