@@ -5,9 +5,11 @@ written by the build, from the commands themselves. Neither building nor reading
 are checked by a test.
 """
 
+import ast
 import contextlib
 import inspect
 import io
+import json
 import os
 import re
 import sys
@@ -83,21 +85,61 @@ def list_functions() -> str:
 
 def write_references(app: Sphinx) -> None:
     """Write the pages that are made from the program, where they changed."""
-    for page, text in (("cli", list_options()), ("python", list_functions())):
-        path = DOCS / "reference" / f"{page}.md"
+    gallery = list_gallery()
+    pages = {f"gallery/{name}": text for name, text in gallery.items()} | {"gallery/index": list_gallery_index(gallery)}
+    for page, text in {"reference/cli": list_options(), "reference/python": list_functions(), **pages}.items():
+        path = DOCS / f"{page}.md"
         path.parent.mkdir(exist_ok=True)
         if not path.exists() or path.read_text(encoding="utf-8") != text:
             path.write_text(text, encoding="utf-8")
 
 
-def drop_empty_globs(app: Sphinx, page: str, source: list[str]) -> None:
-    """Remove from the index the patterns that no page matches: each would be a warning."""
-    if page == "index":
-        lines = source[0].split("\n")
-        source[0] = "\n".join(line for line in lines if not line.endswith("*") or any(DOCS.glob(f"{line}.md")))
+def list_gallery() -> dict[str, str]:
+    """Return the pages of the gallery by name: each script and notebook of docs/examples with its pictures."""
+    pages = {}
+    for script in sorted((DOCS / "examples").glob("*.py")):
+        text = script.read_text(encoding="utf-8")
+        doc = ast.get_docstring(ast.parse(text)) or ""
+        title, _, more = doc.partition(": " if ": " in doc.split("\n")[0] else "\n")
+        picture = _show_picture(f"{script.stem}.png")
+        code = text.partition('"""\n')[2] if text.startswith('"""') else text
+        more = more.strip()
+        pages[script.stem] = (
+            f"# {title.strip('.')}\n\n{more[:1].upper()}{more[1:]}\n\n{picture}```python\n{code.strip()}\n```\n"
+        )
+    for notebook in sorted((DOCS / "examples").glob("*.ipynb")):
+        cells = json.loads(notebook.read_text(encoding="utf-8"))["cells"]
+        parts = []
+        for k, cell in enumerate(cells):
+            source = "".join(cell["source"])
+            parts.append(source if cell["cell_type"] == "markdown" else f"```python\n{source}\n```")
+            parts.append(_show_picture(f"{notebook.stem}_{k}.png"))
+        pages[notebook.stem] = "\n\n".join(part for part in parts if part) + "\n"
+    return pages
+
+
+def _show_picture(name: str) -> str:
+    """Return the lines that show a picture of the gallery; empty where there is none."""
+    return f"![{name}](../images/gallery/{name})\n\n" if (DOCS / "images" / "gallery" / name).exists() else ""
+
+
+def list_gallery_index(pages: dict[str, str]) -> str:
+    """Return the gallery's first page, which lists the others."""
+    lines = [
+        "# Gallery",
+        "",
+        "Scripts and notebooks of `docs/examples`, run by the tests; their pictures are written by",
+        "`python docs/figures.py --pictures`. A script takes the path of its picture.",
+        "",
+        "```{toctree}",
+        ":maxdepth: 1",
+        "",
+        *pages,
+        "```",
+    ]
+    return "\n".join(lines) + "\n"
 
 
 def setup(app: Sphinx) -> None:
-    """Connect what is done before the pages are read."""
+    """Write the pages that are made from the program before all are read."""
     app.connect("builder-inited", write_references)
-    app.connect("source-read", drop_empty_globs)

@@ -1,6 +1,6 @@
 """Write or check the figures in README and docs: the output of the commands that the pages name.
 
-    python docs/figures.py [--check] [--slow] [PAGE ...]
+    python docs/figures.py [--check] [--slow] [--pictures] [PAGE ...]
 
 A page names a command in a comment, and its output follows up to the end mark:
 
@@ -8,10 +8,12 @@ A page names a command in a comment, and its output follows up to the end mark:
     <!-- end of figures -->
 
 ``slow figures:`` marks commands of minutes, which run with ``--slow``. ``--check`` changes nothing, and ends with
-status 1 where a number is off by more than 2 % and more than its last digit.
+status 1 where a number is off by more than 2 % and more than its last digit. ``--pictures`` runs the examples and
+writes their pictures into docs/images/gallery.
 """
 
 import argparse
+import json
 import os
 import re
 import shlex
@@ -20,7 +22,9 @@ import sys
 import tempfile
 from pathlib import Path
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).resolve().parents[1]
+EXAMPLES = ROOT / "docs" / "examples"
+GALLERY = ROOT / "docs" / "images" / "gallery"
 BLOCK = re.compile(
     r"<!-- (?P<slow>slow )?figures: (?P<command>[^\n]+) -->\n(?P<body>.*?)<!-- end of figures -->", re.DOTALL
 )
@@ -89,6 +93,50 @@ def update(page: Path, check: bool, slow: bool) -> bool:
     return right
 
 
+def draw_pictures() -> None:
+    """Run the scripts and notebooks of docs/examples, and write their pictures for the site's gallery."""
+    GALLERY.mkdir(parents=True, exist_ok=True)
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "MPLBACKEND": "agg"}
+    for script in sorted(EXAMPLES.glob("*.py")):
+        if "sys.argv[1:]" not in script.read_text(encoding="utf-8"):  # its only argument is a picture's path
+            picture = GALLERY / f"{script.stem}.png"
+            subprocess.run([sys.executable, str(script), str(picture)], env=environment, check=True)
+    for notebook in sorted(EXAMPLES.glob("*.ipynb")):
+        subprocess.run([sys.executable, __file__, "--notebook", str(notebook)], env=environment, check=True)
+    for picture in GALLERY.glob("*.png"):
+        _reduce(picture)
+
+
+def _reduce(picture: Path) -> None:
+    """Reduce a picture to 900 px of width and 128 colours, as it is part of every installation."""
+    from PIL import Image
+
+    image = Image.open(picture).convert("RGB")
+    image.thumbnail((900, 900))
+    image.quantize(128, dither=Image.Dither.NONE).save(picture, optimize=True)
+
+
+def run_notebook(notebook: Path, folder: Path | None = None, scale: float | None = None) -> None:
+    """Run the code of a notebook in this process; write the pictures of cell k as NAME_k.png into ``folder``.
+
+    ``scale`` replaces the resolution that the notebook states, to be quicker.
+    """
+    import matplotlib.pyplot as plt
+
+    names: dict[str, object] = {"__name__": "__main__"}
+    for k, cell in enumerate(json.loads(notebook.read_text(encoding="utf-8"))["cells"]):
+        code = "".join(cell["source"])
+        if cell["cell_type"] != "code":
+            continue
+        if scale is not None:
+            code = re.sub(r"(?m)^SCALE = [\d.]+", f"SCALE = {scale}", code)
+        exec(compile(code, notebook.name, "exec"), names)  # noqa: S102 - our own notebook
+        if plt.get_fignums():
+            if folder is not None:
+                plt.savefig(folder / f"{notebook.stem}_{k}.png", dpi=80)
+            plt.close("all")
+
+
 def main() -> int:
     """Run the commands of the pages; returns the exit status."""
     assert __doc__ is not None
@@ -96,7 +144,15 @@ def main() -> int:
     parser.add_argument("pages", nargs="*", type=Path, help="by default README and all of docs")
     parser.add_argument("--check", action="store_true", help="compare, and change nothing")
     parser.add_argument("--slow", action="store_true", help="also commands that take minutes")
+    parser.add_argument("--pictures", action="store_true", help="run the examples, and write their pictures")
+    parser.add_argument("--notebook", type=Path, help="run one notebook, and write its pictures")
     given = parser.parse_args()
+    if given.notebook:
+        run_notebook(given.notebook, GALLERY)
+        return 0
+    if given.pictures:
+        draw_pictures()
+        return 0
     right = [update(page.resolve(), given.check, given.slow) for page in given.pages or find_pages()]
     return int(given.check and not all(right))
 

@@ -29,7 +29,7 @@ from slviewer.devices.protocols import (
 from slviewer.errors import DetectionError, DeviceError, InputError, TurntableError
 from slviewer.fringe.patterns import render
 from slviewer.fringe.presets import gray_bits, phase_steps
-from slviewer.fringe.sequence import Frame, PatternSequence
+from slviewer.fringe.sequence import Frame, PatternSequence, PerAxis
 from slviewer.pipeline.conformance import (
     check_board,
     check_camera,
@@ -53,9 +53,9 @@ from slviewer.target.board import Board, BoardType
 
 __all__ = [
     "Board", "BoardType", "Camera", "CameraSettings", "DetectionError", "DeviceError", "Driver", "Exporter",
-    "FolderLayout", "Frame", "ImportableRecording", "InputError", "Mesh", "Openable", "PatternSequence", "PointSet",
-    "Projector", "Rig", "Turntable", "TurntableError", "check_angle", "check_board", "check_camera", "check_complete",
-    "check_exporter", "check_frame", "check_importer", "check_index", "check_level", "check_projector",
-    "check_sequence", "check_turntable", "define_layout", "gray_bits", "has_images", "match_images", "phase_steps",
-    "render", "strangers_warning",
+    "FolderLayout", "Frame", "ImportableRecording", "InputError", "Mesh", "Openable", "PatternSequence", "PerAxis",
+    "PointSet", "Projector", "Rig", "Turntable", "TurntableError", "check_angle", "check_board", "check_camera",
+    "check_complete", "check_exporter", "check_frame", "check_importer", "check_index", "check_level",
+    "check_projector", "check_sequence", "check_turntable", "define_layout", "gray_bits", "has_images",
+    "match_images", "phase_steps", "render", "strangers_warning",
 ]  # fmt: skip

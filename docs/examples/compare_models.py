@@ -1,4 +1,4 @@
-"""Compare the stereo and the pixelwise model on a plane, as two error maps: compare_models.py PICTURE."""
+"""Compare the three models on a plane, as error maps."""
 
 import sys
 from pathlib import Path
@@ -8,13 +8,16 @@ import slviewer as sl
 folder = sl.datasets.fetch("sample")
 poses = sl.read_captures(folder / "poses")
 frames = {pose.name: pose.frames for pose in poses}
-calibration = sl.calibrate_frames(poses[0].sequence, frames, "circles:21x16:9", models=["stereo", "pixelwise"])
+calibration = sl.calibrate_frames(
+    poses[0].sequence, frames, "circles:21x16:9", models=["stereo", "pixelwise", "splined"]
+)
 (scan,) = sl.read_captures(folder / "scan")
 phases = {axis: sl.decode(scan.sequence, scan.frames, axis) for axis in scan.sequence.axes}
-assert calibration.pixelwise
+assert calibration.pixelwise and calibration.splined
 clouds = {
     "stereo": sl.reconstruct_cloud(calibration.stereo, phases),
     "pixelwise": sl.reconstruct_cloud(calibration.pixelwise, phases),
+    "splined": sl.reconstruct_cloud(calibration.splined, phases),
 }
 planes = {}
 for name, cloud in clouds.items():

@@ -99,7 +99,8 @@ def define_layout(
 ) -> FolderLayout:
     """Return a layout whose captures are recognised by their file names alone.
 
-    ``describe(folder, name, projector, **options)`` returns the recording of one folder and warnings;
+    ``describe(folder, name, projector)`` returns the recording of one folder and warnings; it may have more parameters,
+    which Python passes to `read`;
     ``needs_projector``: what depends on the projector's size, if anything does.
     """
     default = projector
