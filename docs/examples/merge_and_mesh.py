@@ -22,6 +22,7 @@ meshed = sl.mesh(session, ["merge/1"], plan=MeshingPlan(triangles=20_000))
 print(meshed.text())
 
 surface = merged.fused.surface
+assert surface.normals is not None
 x, y = surface.points[::2, 0], -surface.points[::2, 1]
 shade = surface.normals[::2] @ [-0.4, -0.5, -0.77]  # lit from the upper left, behind the camera
 figure, axis = plt.subplots(figsize=(5, 4.2), layout="constrained")

@@ -7,6 +7,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import slviewer as sl
+from slviewer.evaluation.sphere import SphereResult
 
 folder = sl.datasets.fetch("sample")
 session = tempfile.mkdtemp() + "/session"
@@ -16,14 +17,16 @@ sl.calibrate(session, "circles:21x16:9")
 
 # The splined model alone predicts the calibration's part of the uncertainty. `verify` finds the sphere in the scan.
 comparison = sl.verify(session, [scan], "sphere", models=["splined"]).captures[scan]
-sphere = comparison.results["splined"].sphere
+found = comparison.results["splined"]
+assert isinstance(found, SphereResult)
+sphere = found.sphere
 measured = sl.measure(session, scan, "sphere", ball=(*sphere.centre, sphere.radius + 5), model="splined")
 diameter = measured["diameter"]
 assert diameter.whole  # the calibration's part is in it
 print(f"diameter {diameter.value:.3f} mm, U {diameter.U:.3f} mm (k = 2)")
 print(f"the standard uncertainty is {diameter.sigma:.4f} mm; the pitch of the board is taken as exact")
 
-errors = comparison.results["splined"].error_map
+errors = found.error_map
 limit = float(np.nanquantile(np.abs(errors), 0.99))
 figure, axis = plt.subplots(figsize=(5, 3.6), layout="constrained")
 figure.colorbar(axis.imshow(errors, cmap="RdBu_r", vmin=-limit, vmax=limit), label="distance from the sphere, mm")
