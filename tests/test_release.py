@@ -2,6 +2,7 @@
 
 import os
 import re
+import shlex
 import subprocess
 import sys
 import sysconfig
@@ -12,6 +13,7 @@ import zipfile
 from pathlib import Path
 
 import pytest
+import trimesh
 
 import slviewer
 
@@ -80,15 +82,21 @@ def test_a_wheel_works_without_the_checkout(built, tmp_path) -> None:
     where, *versions = run(_python(tmp_path), "-c", show, cwd=tmp_path).split()
     assert Path(where).is_relative_to(site) and versions == [version, version]
 
-    def slviewer_command(*arguments: str) -> str:
-        return run(_python(tmp_path), "-m", "slviewer.cli", *arguments, cwd=tmp_path)
+    assert run(_python(tmp_path), "-m", "slviewer.cli", "--version", cwd=tmp_path).split() == ["slviewer", version]
+    for line in _quick_start():
+        run(_python(tmp_path), "-m", "slviewer.cli", *shlex.split(line)[1:], cwd=tmp_path)
+    ply, mesh = tmp_path / "object.ply", trimesh.load(tmp_path / "object.stl")
+    assert ply.read_bytes()[:3] == b"ply"
+    assert len(mesh.faces) > 20_000 and 100 < mesh.extents.max() < 200  # the object is 150 mm wide
 
-    assert slviewer_command("--version").split() == ["slviewer", version]
-    slviewer_command("simulate", "s", "--scale", "0.15", "--poses", "6")
-    slviewer_command("calibrate", "s", "--target", "circles:21x16:9", "--models", "stereo")
-    slviewer_command("reconstruct", "s", "plane_01", "--out", "plane.ply")
-    slviewer_command("mesh", "s", "plane_01", "--out", "plane.stl")
-    assert (tmp_path / "plane.ply").read_bytes()[:3] == b"ply" and (tmp_path / "plane.stl").stat().st_size > 10_000
+
+def _quick_start() -> list[str]:
+    """Return the commands of the quick start, as they are written."""
+    page = (ROOT / "docs" / "quickstart.md").read_text("utf-8")
+    blocks = re.findall(r"(?<! -->\n)^```bash\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+    lines = [line for block in blocks for line in block.splitlines() if line]
+    assert len(lines) > 8 and all(line.startswith("slviewer ") for line in lines)
+    return lines
 
 
 def _python(folder: Path) -> Path:

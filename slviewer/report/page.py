@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from slviewer import __version__
 from slviewer.errors import InputError
 from slviewer.printable import escape_controls
+from slviewer.session.atomic import rename
 
 CERTIFICATE = r'<template id="certificate">(.*?)</template>'
 """Where a page keeps what it was made from, as escaped JSON; browsers neither show nor run it."""
@@ -172,7 +173,7 @@ def write_page(
             file.write(page.encode())
             file.flush()
             os.fsync(file.fileno())
-        os.replace(temporary, path)
+        rename(temporary, path)
     except OSError as error:
         raise InputError(f"{path} cannot be written ({error.strerror}): choose another place or free it") from error
     finally:

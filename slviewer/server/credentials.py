@@ -19,6 +19,7 @@ from typing import Any
 from slviewer.errors import SlviewerError, UsageError
 from slviewer.server.access import ROLES, Role
 from slviewer.server.binding import network_address
+from slviewer.session.atomic import rename
 
 _MOST_BYTES = 4096
 _VALID_DAYS = 397
@@ -187,6 +188,6 @@ def _write_private(path: Path, content: bytes) -> None:
             file.write(content)
             file.flush()
             os.fsync(file.fileno())
-        os.replace(temporary, path)
+        rename(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)

@@ -14,6 +14,7 @@ import os
 import re
 import secrets
 import shutil
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -26,6 +27,7 @@ from slviewer.session.reading import decoding, read_json
 _LEFTOVER = re.compile(r"\.(?P<name>.+)\.(?P<state>tmp|done|new)-\d+-[0-9a-f]+")
 _TOGETHER = "together"
 _SYNCS_FOLDERS = os.name != "nt"
+_PATIENCE_S = 2.0 if os.name == "nt" else 0.0
 _SPARE_BYTES = 1 << 20  # metadata, folders, the file system's own rounding
 
 
@@ -38,6 +40,23 @@ def sync_folder(folder: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+def rename(source: Path, target: Path) -> None:
+    """Rename a file over another one, or a folder to a name that is free.
+
+    Windows refuses while another program has it open, such as a virus scanner, an indexer or a copy of the folder: it
+    is tried again for `_PATIENCE_S`.
+    """
+    end = time.monotonic() + _PATIENCE_S
+    while True:
+        try:
+            os.replace(source, target) if source.is_file() else os.rename(source, target)
+            return
+        except PermissionError:
+            if time.monotonic() > end:
+                raise
+            time.sleep(0.05)
 
 
 def write_bytes(path: Path, *parts: Any) -> None:
@@ -71,7 +90,7 @@ def replace_file(path: Path, data: bytes) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
             write_bytes(temporary, data)
-            os.replace(temporary, path)
+            rename(temporary, path)
         except BaseException:
             temporary.unlink(missing_ok=True)
             raise
@@ -100,7 +119,7 @@ def arriving_path(path: Path, needs_bytes: int = 0) -> Iterator[Path]:
             yield temporary
             with open(temporary, "rb+") as file:
                 os.fsync(file.fileno())
-            os.replace(temporary, path)
+            rename(temporary, path)
         except BaseException:
             temporary.unlink(missing_ok=True)
             raise
@@ -134,7 +153,7 @@ def mark_complete(folder: Path) -> Path:
     assert match is not None, folder
     complete = _staging_path(folder.with_name(match["name"]), "done")
     with disk_errors(folder.parent):
-        os.rename(folder, complete)
+        rename(folder, complete)
     return complete
 
 
@@ -143,11 +162,11 @@ def commit(folder: Path, target: Path, old_to: Path | None = None) -> None:
     with disk_errors(target.parent):
         if target.exists():
             decided = _staging_path(target, "new")
-            os.rename(folder, decided)
+            rename(folder, decided)
             sync_folder(target.parent)
             _move_away(target, old_to)
             folder = decided
-        os.rename(folder, target)
+        rename(folder, target)
         sync_folder(target.parent)
 
 
@@ -197,7 +216,7 @@ class Together:
         try:
             with disk_errors(self._root):
                 write_bytes(temporary, to_json({"changes": listed}))
-                os.replace(temporary, decided)
+                rename(temporary, decided)
         except BaseException:
             discard(temporary)
             self.discard()
@@ -216,7 +235,7 @@ def _finish_together(decided: Path) -> None:
                 _move_away(target, old_to)
                 sync_folder(target.parent)
             if staged is not None and is_waiting:
-                os.rename(staged, target)
+                rename(staged, target)
                 sync_folder(target.parent)
         decided.unlink()
         sync_folder(root)
@@ -243,7 +262,7 @@ def move(folder: Path, target: Path) -> None:
     """Rename a folder within the session and make that durable."""
     with disk_errors(target.parent):
         target.parent.mkdir(parents=True, exist_ok=True)
-        os.rename(folder, target)
+        rename(folder, target)
         sync_folder(target.parent)
         sync_folder(folder.parent)
 
@@ -291,7 +310,7 @@ def recover(root: Path, trash_place: Callable[[Path], Path]) -> list[Path]:
                 continue
             if target.exists():
                 move(target, trash_place(target))
-            os.rename(path, target)
+            rename(path, target)
             sync_folder(target.parent)
         completed.append(target)
     return completed
@@ -303,7 +322,7 @@ def _move_away(target: Path, old_to: Path | None) -> None:
         move(target, old_to)
         return
     doomed = _staging_path(target, "tmp")
-    os.rename(target, doomed)
+    rename(target, doomed)
     discard(doomed)
 
 

@@ -1,5 +1,6 @@
 """What makes a folder a session: `session.json` with a schema that this program reads."""
 
+import sys
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -8,6 +9,9 @@ from slviewer.errors import SessionError
 from slviewer.session.atomic import disk_errors, replace_json
 from slviewer.session.reading import expand_user, read_json
 
+_IS_WINDOWS = sys.platform == "win32"
+_LONGEST_FOLDER = 120
+"""Characters of a session's path under Windows, which leave the rest to the names of captures and their frames."""
 SCHEMA = 2
 """Of new sessions: 1, and since 2 frames and arrays have checksums, which programs that know only 1 do not read."""
 
@@ -38,6 +42,11 @@ def session_folder(path: str | Path) -> Path:
 def new_folder(path: str | Path) -> tuple[Path, bool]:
     """A folder that a session may be made in, and whether it was made here, else empty; SessionError otherwise."""
     folder = _absolute_path(path)
+    if _IS_WINDOWS and len(str(folder)) > _LONGEST_FOLDER:
+        raise SessionError(
+            f"the path of the session has {len(str(folder))} characters, and Windows allows 259 for each file in it: "
+            f"choose a place with at most {_LONGEST_FOLDER}"
+        )
     if is_session(folder):
         raise SessionError(f"{folder} is a session already: open it, or choose another folder")
     try:

@@ -1,6 +1,7 @@
 """Names of captures and results: safe as folder names on every system, sorted as a person counts."""
 
 import re
+from collections.abc import Iterable
 
 from slviewer.errors import InputError
 
@@ -24,11 +25,17 @@ def is_safe_name(name: str) -> bool:
     return isinstance(name, str) and _SAFE.fullmatch(name) is not None and not name.endswith(".")
 
 
-def new_name(name: str) -> str:
-    """Return a `safe_name` for something new: none that Windows keeps for a device, so that sessions can be copied
-    there. Raises InputError otherwise. What has such a name already can be read."""
+def new_name(name: str, others: Iterable[str] = ()) -> str:
+    """Return a `safe_name` for something new: none that Windows keeps for a device, and none that differs from one of
+    ``others`` in its case alone, so that sessions can be copied there. Raises InputError otherwise. What has such a
+    name already can be read."""
     if _DEVICE.fullmatch(safe_name(name)):
         raise InputError(f"{name!r} cannot be a name: Windows keeps it for a device: choose another one")
+    for other in others:
+        if other != name and other.lower() == name.lower():
+            raise InputError(
+                f"{name!r} cannot be a name beside {other!r}: Windows and macOS do not tell them apart: choose another"
+            )
     return name
 
 

@@ -204,8 +204,8 @@ class Session(Decisions):
         staged: dict[str, Path] = {}
         try:
             for new in captures:
-                if new.name in staged:
-                    raise InputError(f"two captures are named {new.name!r}: rename one of their folders")
+                if new.name.lower() in map(str.lower, staged):
+                    raise InputError(f"two captures are named {new.name!r}, or alike: rename one of their folders")
                 replace = force if isinstance(force, bool) else new.name in force
                 staged[new.name] = self._stage(new, role, None if board is None else str(board), replace)
                 del new  # before the next one is made
@@ -416,7 +416,7 @@ class Session(Decisions):
     def save_rig(self, name: str, text: str) -> Path:
         """Keep the operator's own rig, TOML, in place of one of that name; returns its file."""
         self._require_writer()
-        path = self.folder / "rigs" / f"{new_name(name)}.toml"
+        path = self.folder / "rigs" / f"{new_name(name, self.rigs())}.toml"
         atomic.replace_file(path, text.encode())
         return path
 
@@ -464,7 +464,7 @@ class Session(Decisions):
     def _stage(self, capture: NewCapture, role: Role, board: str | None, force: bool) -> Path:
         """Write a capture next to its place, and return the folder, which `atomic.commit` renames."""
         self._require_writer()
-        target = self._capture_folder(new_name(capture.name))
+        target = self._capture_folder(new_name(capture.name, self.taken_names()))
         if target.exists() and not force:
             raise InputError(
                 f"there is a capture {capture.name!r} already: choose another name, or replace it with --force"

@@ -264,7 +264,10 @@ def _measure_use() -> tuple[float, float, float]:
     import resource
 
     try:
-        pages, files = int(Path("/proc/self/statm").read_text().split()[1]), len(list(Path("/proc/self/fd").iterdir()))
+        pages, files = (
+            int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1]),
+            len(list(Path("/proc/self/fd").iterdir())),
+        )
     except OSError:
         return (float("nan"),) * 3
     return pages * resource.getpagesize() / 1e6, files, threading.active_count()

@@ -107,7 +107,7 @@ def _simulate(session: Path, scale: float, seed: int, progress: Progress) -> Non
 def _load_truth(session: Path) -> dict[str, Any]:
     """The stored ground truth of a simulated session; empty where there is none."""
     path = session / TRUTH
-    truth: dict[str, Any] = json.loads(path.read_text()) if path.is_file() else {}
+    truth: dict[str, Any] = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
     return truth
 
 

@@ -1,6 +1,5 @@
 """Files for other programs, made in the session's `exports` folder."""
 
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -10,6 +9,7 @@ from slviewer.pipeline.feedback import Warn
 from slviewer.pipeline.mesh import MERGE, mesh
 from slviewer.pipeline.models import accepts_rejected
 from slviewer.session import atomic
+from slviewer.session.atomic import rename
 from slviewer.session.names import safe_name
 from slviewer.session.store import Session
 from slviewer.surface.meshing import MeshingPlan
@@ -24,7 +24,7 @@ def staged_export(session: Session, name: str, report: Reporter) -> Iterator[Pat
     with atomic.staged_folder(target, 0) as folder:
         yield folder / name
         report.saving()
-        os.replace(folder / name, target)
+        rename(folder / name, target)
     atomic.discard(folder)
 
 

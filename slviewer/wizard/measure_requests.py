@@ -1,6 +1,5 @@
 """Requests to measure on surfaces: points, distances, fits, sections, deviations from a nominal model."""
 
-import os
 import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -17,6 +16,7 @@ from slviewer.pipeline.inspect_parts import Inspection, inspect_surfaces, save_i
 from slviewer.pipeline.measured_surface import MeasuredSurface
 from slviewer.pipeline.plan import TOLERANCE_MM, make_plan
 from slviewer.session import atomic
+from slviewer.session.atomic import rename
 from slviewer.session.inspection_plan import OWN_PLAN, PLANS, list_plans, read_plan, write_plan
 from slviewer.session.measurements import Measurement
 from slviewer.session.names import safe_name
@@ -104,7 +104,7 @@ class MeasureRequests(RequestHandler):
                 (folder / plain).write_bytes(content)
                 description = read(folder / plain)
                 report.saving()
-                os.replace(folder / plain, target)
+                rename(folder / plain, target)
             atomic.discard(folder)
             report(1.0, "read")
             return description
@@ -140,7 +140,7 @@ class MeasureRequests(RequestHandler):
                 written = write_inspection(inspection, folder)
                 report.saving()
                 for path in written.files:
-                    os.replace(path, store.exports / path.name)
+                    rename(path, store.exports / path.name)
             atomic.discard(folder)
             save_inspection(store.guarded(report.saving), inspection, inputs)
             report(1.0, "inspected")
