@@ -7,9 +7,11 @@ A page names a command in a comment, and its output follows up to the end mark:
     <!-- figures: slviewer plan-rig webcam-1080p pocket-720p 500 -->
     <!-- end of figures -->
 
-``slow figures:`` marks commands of minutes, which run with ``--slow``. ``--check`` changes nothing, and ends with
-status 1 where a number is off by more than 2 % and more than its last digit. ``--pictures`` runs the examples and
-writes their pictures into docs/images/gallery.
+Single numbers in a sentence or a table follow a comment ``<!-- = NAME -->`` and end with ``<!-- . -->``;
+`compute_values` tells how they follow from the JSON of ``slviewer reproduce --quick``. These, and ``slow figures:``,
+need commands of minutes, which run with ``--slow``. ``--check`` changes nothing, and ends with status 1 where a number
+is off by more than 2 % and more than its last digit. ``--pictures`` runs the examples and writes their pictures into
+docs/images/gallery.
 """
 
 import argparse
@@ -20,7 +22,10 @@ import shlex
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterable
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = ROOT / "docs" / "examples"
@@ -30,6 +35,38 @@ BLOCK = re.compile(
 )
 NUMBER = re.compile(r"\d+(?:\.\d+)?")
 TOLERANCE = 0.02
+
+
+VALUE = re.compile(r"<!-- = (?P<name>[^\n>]+) -->(?P<number>[\d.]+)<!-- \. -->")
+REPRODUCE = "slviewer reproduce --quick"
+
+
+def compute_values(data: dict[str, Any]) -> dict[str, float]:
+    """Return the numbers of the pages by name, from the JSON of `REPRODUCE`."""
+    inside = {name: each for name, each in data["planes"].items() if each["incidence"]["R2"] >= 87.0}
+    values = {"inside ratio": data["in_range_ratio"]}
+    for group, captures in (("planes", data["planes"]), ("inside", inside), ("spheres", data["spheres"])):
+        for model in ("stereo", "pixelwise"):
+            values[f"{group} {model}"] = _mean(each["models"][model]["rms_mm"] for each in captures.values())
+        values[f"{group} floor"] = _mean(each["models"]["stereo"]["noise_floor_mm"] for each in captures.values())
+    for model in ("stereo", "pixelwise"):
+        values[f"radius {model}"] = _mean(each["models"][model]["radius_mm"] for each in data["spheres"].values())
+        values[f"spacing {model}"] = data["spacing_rms_mm"][model]
+    return values
+
+
+def _mean(numbers: Iterable[float]) -> float:
+    """Return the mean of some numbers."""
+    listed = list(numbers)
+    return sum(listed) / len(listed)
+
+
+@cache
+def reproduce() -> dict[str, float]:
+    """Run `REPRODUCE`, some minutes, and return the numbers of the pages by name."""
+    with tempfile.TemporaryDirectory() as folder:
+        run(f"{REPRODUCE} --out {folder}/reproduction --json {folder}/result.json")
+        return compute_values(json.loads(Path(folder, "result.json").read_text(encoding="utf-8")))
 
 
 def find_pages() -> list[Path]:
@@ -87,7 +124,20 @@ def update(page: Path, check: bool, slow: bool) -> bool:
         print(f"{page.name}: {match['command']}\n--- written{match['body']}--- printed{printed}")
         return f"<!-- {match['slow'] or ''}figures: {match['command']} -->\n{printed}<!-- end of figures -->"
 
+    def replace_value(match: re.Match[str]) -> str:
+        """Return the number with its marks."""
+        nonlocal right
+        digits = len(match["number"].partition(".")[2])
+        number = f"{reproduce()[match['name']]:.{digits}f}"
+        if agree(match["number"], number):
+            return match[0]
+        right = False
+        print(f"{page.name}: {match['name']} is {number}, written {match['number']}")
+        return f"<!-- = {match['name']} -->{number}<!-- . -->"
+
     changed = BLOCK.sub(replace, text)
+    if slow:
+        changed = VALUE.sub(replace_value, changed)
     if not check and changed != text:
         page.write_text(changed, encoding="utf-8")
     return right

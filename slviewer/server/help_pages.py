@@ -23,11 +23,13 @@ _GROUPS = {
     "howto": "How to",
     "hardware": "Hardware",
     "explanation": "Explanation",
+    "reference": "Reference",
 }
 """{folder: title}, in the order of the list; the folders whose pages are shown."""
-_DEVELOPMENT = ("index.md", "architecture.md")
+_DEVELOPMENT = ("index.md", "architecture.md", "reference/python.md")
 _PICTURES = {".png": "image/png", ".jpg": "image/jpeg", ".webp": "image/webp", ".svg": "image/svg+xml"}
 _HTML = "text/html; charset=utf-8"
+_COMMENT = re.compile(r"<!--.*?-->\n?", re.DOTALL)
 _SCHEME = re.compile(r"[a-z][a-z0-9+.-]*:|//", re.I)
 
 
@@ -170,8 +172,8 @@ def _read_title(path: Path) -> str:
 
 
 def _parse(text: str) -> list[Any]:
-    """Return the tokens of Markdown."""
-    tokens: list[Any] = _parser().parse(text)
+    """Return the tokens of Markdown, without its comments."""
+    tokens: list[Any] = _parser().parse(_COMMENT.sub("", text))
     return tokens
 
 

@@ -90,3 +90,10 @@ def test_every_shipped_page_renders():
     for name in pages.names:
         html = pages.file(name).content.decode()
         assert html.count("<h1") == 1, name
+
+
+def test_comments_of_a_page_are_not_shown(folder):
+    text = "# Four\n\nIt is <!-- = name -->0.2<!-- . --> mm.\n\n<!-- not run: why -->\n```bash\nslviewer\n```\n"
+    (folder / "howto" / "four.md").write_text(text)
+    shown = HelpPages(folder).file("howto/four.md").content.decode()
+    assert "It is 0.2 mm." in shown and "&lt;!--" not in shown and "not run" not in shown and "<code" in shown

@@ -1,0 +1,107 @@
+"""Draw the pictures of the wizard in README and the quick start: an Autopilot run on the simulated rig.
+
+    python docs/screenshots.py
+
+Needs Chromium and the packages of the extra `test`; it takes some minutes. Writes `assets/readme/wizard.webp`, which is
+animated, and `docs/images/wizard_*.png`.
+"""
+
+import re
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from PIL import Image
+from playwright.sync_api import Page, sync_playwright
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT / "tests"))
+
+from chromium import launched  # noqa: E402
+
+SIZE = {"width": 1280, "height": 800}
+SHOWN_WIDTH = 800
+EVERY_S, LONGEST_S = 0.7, 600.0
+FRAME_MS = 900
+TITLE = re.compile("[1-9]\\u2002([A-Z][a-z]+)")  # its number, an en space, its name
+MOST_A_STEP = 2
+"""Frames of each step in the animation: its beginning and its end."""
+PICTURES = {
+    "Poses": "wizard_poses",
+    "Calibrate": "wizard_calibrate",
+    "Scan": "wizard_scan",
+    "Measure": "wizard_measure",
+}
+"""Pictures of the quick start: the last of a step."""
+
+
+def draw_autopilot(page: Page, folder: Path) -> list[tuple[str, Path]]:
+    """Run the Autopilot, and return (the step's title, screenshot) at intervals until it has ended."""
+    page.get_by_role("button", name="Autopilot").click()
+    page.get_by_role("button", name="Stop autopilot").wait_for()
+    shots: list[tuple[str, Path]] = []
+    end = time.monotonic() + LONGEST_S
+    while time.monotonic() < end:
+        path, step = folder / f"{len(shots):03d}.png", find_step(page)
+        page.screenshot(path=path)
+        if step == find_step(page):  # else the picture may show either
+            shots.append((step, path))
+        if not page.get_by_role("button", name="Stop autopilot").is_visible():
+            return shots
+        time.sleep(EVERY_S)
+    raise SystemExit("the Autopilot did not end")
+
+
+def find_step(page: Page) -> str:
+    """Return the title of the step that is shown, such as "Calibrate"; empty where none is."""
+    title = TITLE.search(page.inner_text("body"))
+    return title[1] if title else ""
+
+
+def write_animation(shots: list[Path], path: Path) -> None:
+    """Write an animated WebP of screenshots, reduced."""
+    frames = []
+    for shot in shots:
+        frame = Image.open(shot).convert("RGB")
+        frame.thumbnail((SHOWN_WIDTH, SHOWN_WIDTH), Image.Resampling.LANCZOS)
+        frames.append(frame)
+    durations = [FRAME_MS] * (len(frames) - 1) + [4 * FRAME_MS]
+    frames[0].save(path, save_all=True, append_images=frames[1:], duration=durations, loop=0, quality=60, method=6)
+
+
+def main() -> None:
+    """Start the wizard on loopback, drive it, and write the pictures."""
+    with tempfile.TemporaryDirectory() as folder, sync_playwright() as playwright:
+        command = [sys.executable, "-m", "slviewer.cli", "wizard", f"{folder}/first-session", "--port", "0"]
+        server = subprocess.Popen([*command, "--no-browser"], stdout=subprocess.PIPE, text=True, cwd=folder)
+        try:
+            assert server.stdout is not None
+            link = next(line for line in server.stdout if "slviewer is ready" in line).split()[3]
+            browser = launched(playwright.chromium)
+            page = browser.new_page(viewport=SIZE)  # type: ignore[arg-type]
+            page.goto(link)
+            page.get_by_role("button", name="Autopilot").wait_for(timeout=60_000)
+            time.sleep(3)
+            page.get_by_text("Software WebGL rendering detected").locator(
+                "xpath=ancestor::*[.//button][1]//button"
+            ).first.click()
+            page.screenshot(path=Path(folder) / "start.png")
+            shots = draw_autopilot(page, Path(folder))
+            browser.close()
+        finally:
+            server.terminate()
+            server.wait(30)
+        by_step: dict[str, list[Path]] = {"start": [Path(folder) / "start.png"]}
+        for step, path in shots:
+            by_step.setdefault(step, []).append(path)
+        animated = [path for paths in by_step.values() for path in (paths[:1] + paths[1:][-MOST_A_STEP + 1 :])]
+        write_animation(animated, ROOT / "assets" / "readme" / "wizard.webp")
+        for step, name in PICTURES.items():
+            image = Image.open(by_step[step][-1]).convert("RGB").resize((960, 600), Image.Resampling.LANCZOS)
+            image.quantize(96, dither=Image.Dither.NONE).save(ROOT / "docs" / "images" / f"{name}.png", optimize=True)
+
+
+if __name__ == "__main__":
+    main()
