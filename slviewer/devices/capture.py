@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from slviewer.devices.protocols import CameraSettings, ColourCamera, Rig
-from slviewer.errors import DeviceError, InputError
+from slviewer.errors import DeviceError, InputError, SlviewerError
 from slviewer.fringe.sequence import PatternSequence
 
 MAX_EXPOSURES = 8
@@ -60,6 +60,14 @@ def _capture_loaded(rig: Rig, n: int, out: np.ndarray, progress: Callable[[int, 
         except DeviceError as error:
             raise DeviceError(
                 f"the capture ended at frame {k + 1} of {n}, and its frames were discarded: {error}"
+            ) from error
+        except SlviewerError:
+            raise
+        except Exception as error:  # a driver's own fault, as of a plugin
+            raise DeviceError(
+                f"the capture ended at frame {k + 1} of {n}, and its frames were discarded: the driver of "
+                f"{rig.camera.name} or {rig.projector.name} failed with {type(error).__name__}: {error}; report it to "
+                "the driver's maker"
             ) from error
         if progress is not None:
             progress(k + 1, n)

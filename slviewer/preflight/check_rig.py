@@ -2,9 +2,11 @@
 
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
 
 from slviewer.devices.protocols import Rig
+from slviewer.errors import DeviceError
 from slviewer.pipeline.capture import set_camera
 from slviewer.pipeline.check_results import Check, CheckName, Preflight
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
@@ -52,8 +54,13 @@ def check_rig(
             choice = load_rig(rig, store)
     progress(0.0, "opening the devices")
     with set_up(choice, None).rig.opened() as devices:
+        before = devices.camera.settings()
         set_camera(devices, choice, exposure_ms, gain, warn)
-        return preflight(devices, progress=progress)
+        try:
+            return preflight(devices, progress=progress)
+        finally:  # a camera may keep what it was checked with
+            with suppress(DeviceError):
+                devices.camera.apply(before)
 
 
 def check_capture(session: SessionLike, capture: str, *, progress: Progress = ignore_progress) -> Preflight:

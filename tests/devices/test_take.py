@@ -138,3 +138,20 @@ def test_a_page_that_is_reloaded_between_two_exposures_ends_the_capture():
             capture_with_texture(one, SEQUENCE, (0.5, 4.0), progress=reload)
         with pytest.raises(InputError):
             capture_with_texture(one, SEQUENCE, (0.5, 4.0), out=np.empty((N, 120, 160), np.uint8))
+
+
+def test_a_driver_that_fails_in_its_own_way_is_named():
+    class Failing(type(rig().camera)):  # type: ignore[misc]
+        def grab(self, out):
+            raise ValueError("the sensor says 7")
+
+    good = rig()
+    failing = Rig("failing", Failing(WORLD), good.projector)
+    with failing.opened(), pytest.raises(DeviceError, match=r"frame 1 of .* the sensor says 7"):
+        capture(failing, SEQUENCE)
+    with failing.opened(), pytest.raises(Cancelled):
+
+        def stop(done, of):
+            raise Cancelled("enough")
+
+        capture(failing, SEQUENCE, progress=stop)

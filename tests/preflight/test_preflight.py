@@ -13,7 +13,8 @@ from slviewer.devices.simulated import SimulatedTurntable, simulated_rig
 from slviewer.devices.world import SimulatedWorld
 from slviewer.errors import Cancelled
 from slviewer.pipeline.check_results import Preflight
-from slviewer.preflight.check_rig import preflight
+from slviewer.pipeline.rig_choice import set_up
+from slviewer.preflight.check_rig import check_rig, preflight
 from slviewer.simulation.boards import Pose
 from slviewer.simulation.rig import letter
 
@@ -167,6 +168,19 @@ def test_a_lamp_switched_on_meanwhile_is_named():
     found = looked(rig, say=switch)
     assert "ambient" in wrong_with(found) and "brighter by" in found.check("ambient").sentence
     assert "motion" not in wrong_with(found)
+
+
+def test_the_camera_is_left_as_it_was():
+    set_ups = []
+
+    def remembered(choice, board):
+        set_ups.append(set_up(choice, board))
+        return set_ups[-1]
+
+    check_rig({"driver": "simulated", "scale": SCALE}, exposure_ms=0.5, gain=2.0, set_up=remembered)
+    camera = set_ups[0].rig.camera
+    camera.open()
+    assert camera.settings() == CameraSettings(1.0, 1.0)
 
 
 def test_what_moves_is_named():
