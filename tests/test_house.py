@@ -139,6 +139,12 @@ def test_files_can_be_read_in_one_sitting() -> None:
     assert not long
 
 
+def test_test_modules_have_names_of_their_own() -> None:
+    """Two of one name cannot be collected together, as the folders are no packages."""
+    names = Counter(path.name for path in (ROOT / "tests").rglob("test_*.py"))
+    assert not [name for name, count in names.items() if count > 1]
+
+
 def test_ruff() -> None:
     run = subprocess.run([sys.executable, "-m", "ruff", "check", "."], cwd=ROOT, capture_output=True, text=True)
     assert run.returncode == 0, run.stdout

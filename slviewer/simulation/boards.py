@@ -131,7 +131,8 @@ def printed_board(
     which the simulation does not print.
     """
     if board.kind not in ("circles", "acircles", "chessboard"):
-        raise InputError(f"the simulation does not print {board.kind} boards: use circles, acircles or a chessboard")
+        kind = "ChArUco" if board.kind == "charuco" else board.kind
+        raise InputError(f"the simulation does not print {kind} boards: use circles, acircles or a chessboard")
     diameter = (board.pitch_mm / 2 if diameter_mm is None else diameter_mm) if board.kind != "chessboard" else 0.0
     if diameter > 0.6 * board.pitch_mm:
         raise InputError(f"circles of {diameter:g} mm at a pitch of {board.pitch_mm:g} mm: give 0.6 pitches at most")

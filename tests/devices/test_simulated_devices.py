@@ -191,7 +191,7 @@ def test_another_board_can_be_printed(world, rig):
     assert world.board == board and world.shape.bow_x_mm == 0.1 and world.standing == "board"
     rig.projector.show_level(255)
     assert len(detect(board, seen(rig)).ids) == 54
-    with pytest.raises(InputError, match="charuco"):
+    with pytest.raises(InputError, match="ChArUco"):
         world.print_board(Board.parse("charuco:9x6:15"))
 
 
