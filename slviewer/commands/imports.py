@@ -25,8 +25,8 @@ DESCRIBED = (
         "sequence",
         Path | None,
         None,
-        "The TOML that says what each file shows, by default the one in the source; the README describes it, and "
-        "`slviewer patterns` writes one.",
+        "The TOML that says what each file shows, by default the one in the source; the reference "
+        "describes it, and `slviewer patterns` writes one.",
     ),
     Option(
         "guess",

@@ -144,6 +144,17 @@ def test_the_command_writes_a_description_that_is_read_back(tmp_path: Path, caps
     assert main(["import", "frames", "--guess", str(folder), str(tmp_path / "session")]) == 2
 
 
+def test_images_whose_light_is_red_are_read_in_red(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    _, frames = taken("complementary 4")
+    dark = np.full_like(frames[0], 3)
+    for k, frame in enumerate(frames):
+        cv2.imwrite(str(tmp_path / f"{k}.png"), np.dstack([dark, dark, frame]))
+    assert main(["import", "frames", "--guess", str(tmp_path)]) == 1
+    assert "--channel red" in capsys.readouterr().err
+    assert main(["import", "frames", "--guess", str(tmp_path), "--channel", "red"]) == 0
+    assert len(tomllib.loads(capsys.readouterr().out)["frame"]) == len(frames)
+
+
 @pytest.mark.parametrize(
     ("folder", "kinds"),
     [

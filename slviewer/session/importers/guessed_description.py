@@ -35,7 +35,9 @@ def guess_description(
     guess = guess_sequence(images.stack, projector)
     names = [file.name for file in files]
     shown = (channel or DEFAULT_CHANNEL) if images.in_colour else channel
-    doubts = tuple(f"{_format_span(names, indices)}: {text}" for indices, text in guess.doubts)
+    other = "; the green of these colour images was read: try --channel red, blue or max"
+    hint = other if images.in_colour and channel is None and not any(guess.frames) else ""
+    doubts = tuple(f"{_format_span(names, indices)}: {text}{hint}" for indices, text in guess.doubts)
     return GuessedDescription(_format_toml(folder, names, guess, shown, projector, doubts), doubts)
 
 
