@@ -34,7 +34,8 @@ class Opened:
         page.on("pageerror", lambda error: self.errors.append(error.stack or str(error)))
 
     def _heard(self, message: ConsoleMessage) -> None:
-        if message.type == "error":
+        # viser's client says so where a panel is redrawn between two messages about one component: nothing is lost
+        if message.type == "error" and "Tried to update non-existent component" not in message.text:
             self.errors.append(message.text)
 
 
