@@ -1,12 +1,13 @@
 """Plugins: what other packages add under entry points. A broken one is reported, and never stops the program."""
 
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
-from functools import cache
+from functools import cached_property
 from importlib.metadata import EntryPoint, entry_points
-from typing import Any, TypeVar
+from typing import Any, Generic, TypeVar
 
-DRIVERS, BOARDS, IMPORTERS, EXPORTERS = (f"slviewer.{kind}" for kind in ("drivers", "boards", "importers", "exporters"))
-"""Groups of entry points."""
+IMPORTERS = "slviewer.importers"
+"""Group of the importers, which the command line lists without importing one."""
 T = TypeVar("T")
 
 
@@ -26,34 +27,39 @@ def list_names(group: str) -> list[str]:
     return sorted({entry.name for entry in entry_points(group=group)})
 
 
-@cache
-def load_plugins(group: str, kind: type, built_in: frozenset[str] = frozenset()) -> tuple[Plugin, ...]:
-    """Import the plugins of a group, in order of their names.
+@dataclass(frozen=True)
+class PluginGroup(Generic[T]):
+    """Plugins under the entry points ``name``: objects of ``kind``, called otherwise than what is ``built_in()``."""
 
-    One has a ``problem`` where its import fails, it is no instance of ``kind``, its ``name`` is not the entry point's,
-    or the name is one of ``built_in`` or of a plugin before it.
-    """
-    plugins: list[Plugin] = []
-    for entry in sorted(entry_points(group=group), key=lambda entry: (entry.name, _name_package(entry))):
-        taken = built_in | {plugin.name for plugin in plugins if not plugin.problem}
-        plugins.append(_load(entry, kind, taken))
-    return tuple(plugins)
+    name: str
+    kind: type[T]
+    built_in: Callable[[], Collection[str]]
+
+    @cached_property
+    def plugins(self) -> tuple[Plugin, ...]:
+        """All of them, in order of their names, imported when this is first read.
+
+        One has a ``problem`` where its import fails, it is no instance of ``kind``, its ``name`` is not the entry
+        point's, or the name is one of ``built_in`` or of a plugin before it.
+        """
+        plugins: list[Plugin] = []
+        for entry in sorted(entry_points(group=self.name), key=lambda entry: (entry.name, _name_package(entry))):
+            taken = {*self.built_in(), *(plugin.name for plugin in plugins if not plugin.problem)}
+            plugins.append(_load(entry, self.kind, taken))
+        return tuple(plugins)
+
+    def usable(self) -> dict[str, T]:
+        """Return the plugins without a problem, by name."""
+        return {plugin.name: plugin.value for plugin in self.plugins if not plugin.problem}
+
+    def explain_missing(self, name: str) -> str:
+        """Return why a plugin cannot be used, as an addition to a message; empty where no plugin has this name."""
+        if name not in list_names(self.name):
+            return ""
+        return "; a plugin of this name cannot be used: `slviewer plugins` shows why"
 
 
-def usable_plugins(group: str, kind: type[T], built_in: frozenset[str] = frozenset()) -> dict[str, T]:
-    """Return the plugins of a group without a problem, by name."""
-    plugins: tuple[Plugin, ...] = load_plugins(group, kind, built_in)  # type: ignore[arg-type]  # mypy: type[T]
-    return {plugin.name: plugin.value for plugin in plugins if not plugin.problem}
-
-
-def explain_missing(group: str, name: str) -> str:
-    """Return why a plugin cannot be used, as an addition to a message; empty where no plugin has this name."""
-    if name not in list_names(group):
-        return ""
-    return "; a plugin of this name cannot be used: `slviewer plugins` shows why"
-
-
-def _load(entry: EntryPoint, kind: type, taken: frozenset[str]) -> Plugin:
+def _load(entry: EntryPoint, kind: type, taken: set[str]) -> Plugin:
     """Import one plugin, and check it."""
     package = _name_package(entry)
     if entry.name in taken:

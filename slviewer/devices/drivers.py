@@ -9,7 +9,7 @@ from importlib.util import find_spec
 
 import slviewer.devices
 from slviewer.devices.protocols import Camera, Projector, Rig, Turntable
-from slviewer.entry_points import DRIVERS, explain_missing, usable_plugins
+from slviewer.entry_points import PluginGroup
 from slviewer.errors import DeviceError, InputError
 
 
@@ -47,8 +47,7 @@ class Driver:
 @cache
 def drivers() -> dict[str, Driver]:
     """Return all drivers by name, usable here or not; those of plugins last."""
-    built_in = builtin_drivers()
-    return built_in | usable_plugins(DRIVERS, Driver, frozenset(built_in))
+    return builtin_drivers() | DRIVER_PLUGINS.usable()
 
 
 @cache
@@ -59,6 +58,9 @@ def builtin_drivers() -> dict[str, Driver]:
     return {driver.name: driver for driver in candidates if isinstance(driver, Driver)}
 
 
+DRIVER_PLUGINS = PluginGroup("slviewer.drivers", Driver, builtin_drivers)
+
+
 def available() -> list[Driver]:
     """List all drivers, those that can be used here first; `needs` and `missing` name what the others require."""
     return sorted(drivers().values(), key=lambda driver: (bool(driver.missing), driver.name))
@@ -67,9 +69,8 @@ def available() -> list[Driver]:
 def driver(name: str) -> Driver:
     """Return the driver called `name`. Raises InputError if there is none, DeviceError if it lacks a package."""
     if name not in drivers():
-        raise InputError(
-            f"no driver is called {name!r}: use one of {', '.join(sorted(drivers()))}{explain_missing(DRIVERS, name)}"
-        )
+        why = DRIVER_PLUGINS.explain_missing(name)
+        raise InputError(f"no driver is called {name!r}: use one of {', '.join(sorted(drivers()))}{why}")
     selected = drivers()[name]
     if selected.missing:
         raise DeviceError(f"the driver {name} cannot be used here, {selected.missing}")

@@ -1,23 +1,17 @@
 """Which plugins are installed, and whether each can be used."""
 
-from slviewer.devices.drivers import Driver, builtin_drivers
-from slviewer.entry_points import BOARDS, DRIVERS, EXPORTERS, IMPORTERS, Plugin, load_plugins
+from slviewer.devices.drivers import DRIVER_PLUGINS
+from slviewer.entry_points import Plugin
 from slviewer.errors import InputError
-from slviewer.session.importers.imported import FolderLayout
-from slviewer.session.importers.layouts import BUILT_IN
-from slviewer.session.mesh_files import IN_WORDS, Exporter
-from slviewer.target.board import EXAMPLES, BoardType
+from slviewer.session.importers.layouts import LAYOUT_PLUGINS
+from slviewer.session.mesh_files import EXPORTER_PLUGINS
+from slviewer.target.board import BOARD_PLUGINS
 
 
 def list_plugins() -> list[Plugin]:
     """All plugins that are installed, group by group; each is imported. One that cannot be used has a ``problem``."""
-    groups: dict[str, tuple[type, frozenset[str]]] = {
-        DRIVERS: (Driver, frozenset(builtin_drivers())),
-        BOARDS: (BoardType, frozenset(EXAMPLES)),
-        IMPORTERS: (FolderLayout, frozenset(BUILT_IN)),
-        EXPORTERS: (Exporter, frozenset(IN_WORDS)),
-    }
-    return [plugin for group, (kind, built_in) in groups.items() for plugin in load_plugins(group, kind, built_in)]
+    groups = (DRIVER_PLUGINS, BOARD_PLUGINS, LAYOUT_PLUGINS, EXPORTER_PLUGINS)
+    return [plugin for group in groups for plugin in group.plugins]
 
 
 def plugins() -> str:

@@ -14,8 +14,7 @@ from typing import Any
 
 import msgspec
 
-from slviewer.devices.drivers import Driver, driver, drivers
-from slviewer.entry_points import DRIVERS, explain_missing
+from slviewer.devices.drivers import DRIVER_PLUGINS, Driver, driver, drivers
 from slviewer.errors import InputError
 from slviewer.pipeline.rig_choice import COMMON_KEYS, Choice, rig_factory
 from slviewer.session.reading import expand_user, read_toml
@@ -148,7 +147,7 @@ def _check_options(name: str, part: str, options: Mapping[str, Any], where: str)
     """Raise InputError unless the driver exists, offers the part, and accepts the options."""
     if name not in drivers():
         offering = sorted(d.name for d in drivers().values() if _driver_factory(d, part) is not None)
-        why = explain_missing(DRIVERS, name)
+        why = DRIVER_PLUGINS.explain_missing(name)
         raise InputError(f"{where}: no driver is called {name!r}: use one of {', '.join(offering)}{why}")
     make = _driver_factory(drivers()[name], part)
     if make is None:

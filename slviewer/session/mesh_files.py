@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from slviewer import __version__
-from slviewer.entry_points import EXPORTERS, usable_plugins
+from slviewer.entry_points import PluginGroup
 from slviewer.errors import InputError
 from slviewer.session.atomic import arriving_file, arriving_path, replace_file
 from slviewer.session.cad import require_packages
@@ -67,9 +67,12 @@ class Exporter:
     takes_meshes: bool = False
 
 
+EXPORTER_PLUGINS = PluginGroup("slviewer.exporters", Exporter, lambda: IN_WORDS)
+
+
 def exporters() -> dict[str, Exporter]:
     """Return the formats of plugins by name."""
-    return usable_plugins(EXPORTERS, Exporter, frozenset(IN_WORDS))
+    return EXPORTER_PLUGINS.usable()
 
 
 def point_formats() -> tuple[str, ...]:

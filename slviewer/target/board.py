@@ -22,7 +22,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from slviewer.entry_points import BOARDS, explain_missing, usable_plugins
+from slviewer.entry_points import PluginGroup
 from slviewer.errors import InputError
 
 Kind = Literal["circles", "acircles", "chessboard", "charuco"]
@@ -61,14 +61,22 @@ class BoardType:
     margin_pitches: float = 0.0
 
 
+BOARD_PLUGINS = PluginGroup("slviewer.boards", BoardType, lambda: EXAMPLES)
+
+
 def plugin_boards() -> dict[str, BoardType]:
     """Return the board types that plugins add, by name."""
-    return usable_plugins(BOARDS, BoardType, frozenset(EXAMPLES))
+    return BOARD_PLUGINS.usable()
 
 
 def board_examples() -> dict[str, str]:
     """Return a notation of each kind of board, those of plugins last."""
     return EXAMPLES | {name: added.example for name, added in plugin_boards().items()}
+
+
+def _find_example(kind: str) -> str:
+    """Return a notation of a kind of board, empty for an unknown one; no plugin is imported for those built in."""
+    return EXAMPLES.get(kind) or board_examples().get(kind, "")
 
 
 @dataclass(frozen=True)
@@ -88,21 +96,21 @@ class Board:
     dictionary: str = ""
 
     def __post_init__(self) -> None:
-        examples = EXAMPLES if self.kind in EXAMPLES else board_examples()
-        if self.kind not in examples:
+        example = _find_example(self.kind)
+        if not example:
             raise InputError(
-                f"there is no board of kind '{self.kind}': use one of {', '.join(examples)}"
-                + explain_missing(BOARDS, self.kind)
+                f"there is no board of kind '{self.kind}': use one of {', '.join(board_examples())}"
+                + BOARD_PLUGINS.explain_missing(self.kind)
             )
         fewest = {"acircles": (2, 3)}.get(self.kind, (3, 3) if self.kind in EXAMPLES else (1, 1))
         if not (fewest[0] <= self.columns <= 200 and fewest[1] <= self.rows <= 200):
             raise InputError(
                 f"a {self.kind} board of {self.columns}x{self.rows} cannot be used: give {fewest[0]} to 200 columns "
-                f"and {fewest[1]} to 200 rows, as in '{examples[self.kind]}'"
+                f"and {fewest[1]} to 200 rows, as in '{example}'"
             )
         if not (math.isfinite(self.pitch_mm) and 0.01 <= self.pitch_mm <= 10_000):
             raise InputError(
-                f"a pitch of {self.pitch_mm:g} mm cannot be used: give 0.01 to 10000 mm, as in '{examples[self.kind]}'"
+                f"a pitch of {self.pitch_mm:g} mm cannot be used: give 0.01 to 10000 mm, as in '{example}'"
             )
         if self.kind == "charuco":
             self._check_markers()
@@ -138,13 +146,12 @@ class Board:
         """Parse a notation such as ``circles:21x16:9``; raises InputError for others."""
         kind, *fields = notation.strip().split(":")
         kind = kind.strip().lower()
-        examples = EXAMPLES if kind in EXAMPLES else board_examples()
-        if kind not in examples:
+        example = _find_example(kind)
+        if not example:
             raise InputError(
-                f"board '{notation}' is not understood: start it with one of {', '.join(examples)}, "
-                f"for example '{EXAMPLES['circles']}'" + explain_missing(BOARDS, kind)
+                f"board '{notation}' is not understood: start it with one of {', '.join(board_examples())}, "
+                f"for example '{EXAMPLES['circles']}'" + BOARD_PLUGINS.explain_missing(kind)
             )
-        example = examples[kind]
         most = 4 if kind == "charuco" else 2
         if not 2 <= len(fields) <= most:
             raise InputError(

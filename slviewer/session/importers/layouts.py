@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from slviewer.entry_points import IMPORTERS, usable_plugins
+from slviewer.entry_points import IMPORTERS, PluginGroup
 from slviewer.errors import InputError
 from slviewer.session.importers import frames, opencv_graycode, p18, procam_calibration, slstudio, sltk
 from slviewer.session.importers.imported import FolderLayout, visible
@@ -19,11 +19,12 @@ BUILT_IN = {
         FolderLayout("frames", "images and a TOML that describes them", frames.read, lambda folder: False),
     )
 }
+LAYOUT_PLUGINS = PluginGroup(IMPORTERS, FolderLayout, lambda: BUILT_IN)
 
 
 def layouts() -> dict[str, FolderLayout]:
     """Return all layouts by name, those of plugins last."""
-    return BUILT_IN | usable_plugins(IMPORTERS, FolderLayout, frozenset(BUILT_IN))
+    return BUILT_IN | LAYOUT_PLUGINS.usable()
 
 
 def detect_layout(source: Path) -> str:
