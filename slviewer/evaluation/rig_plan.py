@@ -149,7 +149,7 @@ def plan_rig(
     camera_px, projector_px = distance / camera.focal_px, away / projector.focal_px[0]
     optics = _Optics(view, camera, projector, light, distance)
     period = period_px or _best_period(float(np.median(optics.blur_px(distance)[is_lit])), camera_px / projector_px)
-    sigmas, modulation = optics.predict_sigma(distance, period)
+    sigmas, modulation = optics.predict_sigma(distance, period, is_lit)
     middle, corner = _middle_and_corner(sigmas)
     depths = distance * _DEPTHS
     is_usable = np.array([_is_usable(optics, z, period, coverage, middle) for z in depths])
@@ -225,7 +225,7 @@ class _Optics:
         blur: np.ndarray = np.sqrt(projector.blur_px**2 + of_projector**2 + 1 / 12 + camera_sigma**2)
         return blur
 
-    def light_on(self, z: float) -> tuple[np.ndarray, np.ndarray]:
+    def light_on(self, z: float, is_lit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the projector's light (h, w) that returns from a white plane at depth z, and the room's, as shares of
         the brightest white: cosine of the incidence, square of the distance, cos^4 of the camera's lens."""
         points = _plane_points(self.rig, z)
@@ -234,14 +234,13 @@ class _Optics:
         away = np.linalg.norm(to_projector, axis=2)
         even = (1 + (self.rig.camera.rays() ** 2).sum(axis=2)) ** -2
         lit = -to_projector[..., 2] / away * even * (z / away) ** 2
-        brightest = np.quantile((lit + self.light.ambient * even)[_is_illuminated(self.rig, z)], _BRIGHT_QUANTILE)
+        brightest = np.quantile((lit + self.light.ambient * even)[is_lit], _BRIGHT_QUANTILE)
         return lit / brightest, self.light.ambient * even / brightest
 
-    def predict_sigma(self, z: float, period: float) -> tuple[np.ndarray, float]:
-        """Return the standard deviation (h, w) mm of depth on the plane at depth z, NaN where it is not illuminated,
+    def predict_sigma(self, z: float, period: float, is_lit: np.ndarray) -> tuple[np.ndarray, float]:
+        """Return the standard deviation (h, w) mm of depth on the plane at depth z, NaN where not ``is_lit`` (h, w),
         and the median modulation in grey levels. The exposure is chosen for a white surface at that depth."""
-        is_lit = _is_illuminated(self.rig, z)
-        lit, room = (part * (PEAK_LEVEL - DARK_LEVEL) * self.light.reflectance for part in self.light_on(z))
+        lit, room = (part * (PEAK_LEVEL - DARK_LEVEL) * self.light.reflectance for part in self.light_on(z, is_lit))
         black, camera = self.projector.black, self.camera
         modulation = lit * (1 - black) / 2 * np.exp(-2 * (np.pi * self.blur_px(z) / period) ** 2)
         variance = camera.read_variance + camera.shot_variance * (lit * (1 + black) / 2 + room) + 1 / 12
@@ -268,9 +267,10 @@ def _middle_and_corner(sigmas: np.ndarray) -> tuple[float, float]:
 
 def _is_usable(optics: _Optics, z: float, period: float, coverage: float, sigma: float) -> bool:
     """Whether at depth z enough is illuminated, and the noise is not far above `sigma`, that of the distance."""
-    if _is_illuminated(optics.rig, z).mean() < _USABLE_COVERAGE * coverage:
+    is_lit = _is_illuminated(optics.rig, z)
+    if is_lit.mean() < _USABLE_COVERAGE * coverage:
         return False
-    return bool(np.nanmedian(optics.predict_sigma(z, period)[0]) <= _USABLE_SIGMA * sigma)
+    return bool(np.nanmedian(optics.predict_sigma(z, period, is_lit)[0]) <= _USABLE_SIGMA * sigma)
 
 
 def _range_around(depths: np.ndarray, usable: np.ndarray, distance: float) -> tuple[float, float]:

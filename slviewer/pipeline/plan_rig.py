@@ -2,7 +2,6 @@
 
 import re
 import tomllib
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -145,7 +144,7 @@ def plan_rig(
         return planned
     progress(0.05, "simulating the rig before a plane")
     measured, expected = _simulate_plane(planned_camera, planned_projector, plan, light)
-    return PlannedRig(camera_text, projector_text, plan, light, measured, expected)
+    return replace(planned, measured=measured, expected=expected)
 
 
 def _simulate_plane(
@@ -153,9 +152,10 @@ def _simulate_plane(
 ) -> tuple[float, float]:
     """Return the RMS in mm of a plane that the simulated rig captured, in the middle of the camera's view, with the
     true calibration; and the one predicted."""
-    rig = plan.rig
     share = min(1.0, np.sqrt(_CHECKED_PX / np.prod(camera.size)))
     size = (int(camera.size[0] * share) // 2 * 2, int(camera.size[1] * share) // 2 * 2)
+    cut = predict_rig(replace(camera, size=size), projector, plan.distance, plan.baseline, light, plan.period_px)
+    rig = cut.rig
     fx, fy = projector.focal_px
     ideal = (0.0,) * 5
     column, row = rig.projector.K[:2, 2].tolist()
@@ -174,81 +174,58 @@ def _simulate_plane(
     plate = blank_board(Pose(np.eye(3), np.array([0.0, 0.0, plan.distance])), (4 * plan.camera_field[0],) * 2)
     sequence = one_axis(complementary(projector.size, light.steps, plan.period_px), "x")
     phase = decode(sequence, Renderer(simulated, plate).capture(sequence), "x")
-    K = rig.camera.K.copy()
-    K[:2, 2] = (size[0] - 1) / 2, (size[1] - 1) / 2
-    model = StereoModel.from_rig(type(rig)(type(rig.camera)(K, np.zeros(5), size), rig.projector, rig.R, rig.t))
-    cloud = reconstruct(model, {"x": phase}, "x")
-    cut = replace(camera, size=size)
-    expected = predict_rig(cut, projector, plan.distance, plan.baseline, light, plan.period_px).sigma_rms
-    return float(evaluate_plane(cloud.points, np.isfinite(cloud.points[..., 2])).rms_mm), expected
+    cloud = reconstruct(StereoModel.from_rig(rig), {"x": phase}, "x")
+    return float(evaluate_plane(cloud.points, np.isfinite(cloud.points[..., 2])).rms_mm), cut.sigma_rms
 
 
 def _read_camera(text: str, lens: float | None) -> tuple[PlannedCamera, str]:
     """Return a camera by its name, or by size and angle of view, and its description."""
-    known = _read_devices("camera")
-    if view := _VIEW.fullmatch(text):
-        entry: Mapping[str, Any] = known["global-shutter-2mp"] | {
-            "size": [int(view[1]), int(view[2])],
-            "view_deg": float(view[3]),
-            "what": f"{text}, noise as 2 Mpx machine vision",
-        }
+    entry, view = _read_device("camera", text, "global-shutter-2mp", "size and angle of view as in 1920x1080:70deg")
+    what = str(entry["what"])
+    if view:
         if view[4] == "mm":
             raise InputError(f"camera {text}: give the angle of view as 70deg, or a known camera with --lens")
+        what = f"{text}, noise as 2 Mpx machine vision"
         entry = {key: value for key, value in entry.items() if key not in ("pixel_um", "lens_mm")}
-    elif text in known:
-        entry = known[text]
-    else:
-        raise InputError(
-            f"no camera is called {text!r}: use {', '.join(known)}, or size and angle of view as in 1920x1080:70deg"
-        )
-    width = entry["size"][0]
+        entry["view_deg"] = float(view[3])
+    size = (int(entry["size"][0]), int(entry["size"][1]))
     if "pixel_um" in entry:
         millimetres = entry["lens_mm"] if lens is None else lens
         if not 1 <= millimetres <= 1000:
             raise InputError(f"a lens of {millimetres:g} mm is impossible: give 1 to 1000 mm")
         focal, aperture = millimetres * 1000 / entry["pixel_um"], millimetres / entry["f_number"]
-        described = f"{entry['what']}, lens {millimetres:g} mm at f/{entry['f_number']:g}"
+        what += f", lens {millimetres:g} mm at f/{entry['f_number']:g}"
     elif lens is not None:
         raise InputError("the lens of this camera is given by its angle of view: omit --lens, or name another camera")
     else:
-        focal = width / 2 / np.tan(np.radians(entry["view_deg"]) / 2)
-        aperture, described = entry.get("aperture_mm", 3.0), entry["what"]
-    size = (int(width), int(entry["size"][1]))
+        focal = size[0] / 2 / np.tan(np.radians(entry["view_deg"]) / 2)
+        aperture = entry.get("aperture_mm", 3.0)
     camera = PlannedCamera(size, focal, aperture, entry["blur_px"], entry["full_well"], entry["read_noise"])
-    return camera, described
+    return camera, what
 
 
 def _read_projector(text: str) -> tuple[PlannedProjector, str]:
     """Return a projector by its name, or by size and throw ratio, and its description."""
-    known = _read_devices("projector")
+    entry, view = _read_device("projector", text, "projector-1080p", "size and throw ratio as in 1920x1080:1.4")
+    ratio, what = (float(view[3]), f"{text}, as a common projector") if view else (entry["throw_ratio"], entry["what"])
+    if not 0.1 <= ratio <= 20:
+        raise InputError(f"a throw ratio of {ratio:g} is impossible: give distance over width, 0.1 to 20")
+    size = (int(entry["size"][0]), int(entry["size"][1]))
+    focal = (size[0] * ratio, size[0] * ratio / entry.get("row_pitch", 1.0))
+    return PlannedProjector(size, focal, entry["offset"], entry["aperture_mm"], entry["blur_px"], entry["black"]), what
+
+
+def _read_device(
+    kind: Literal["camera", "projector"], text: str, typical: str, notation: str
+) -> tuple[dict[str, Any], re.Match[str] | None]:
+    """Return the data of a device by its name; or, where ``text`` is its size and view, those of the ``typical`` one of
+    that size, and the match of `_VIEW`. Raises InputError for others."""
+    known = tomllib.loads(asset("planning/devices.toml").read_text(encoding="utf-8"))[kind]
     if view := _VIEW.fullmatch(text):
-        entry: Mapping[str, Any] = known["projector-1080p"] | {
-            "size": [int(view[1]), int(view[2])],
-            "throw_ratio": float(view[3]),
-            "what": f"{text}, as a common projector",
-        }
-    elif text in known:
-        entry = known[text]
-    else:
-        raise InputError(
-            f"no projector is called {text!r}: use {', '.join(known)}, or size and throw ratio as in 1920x1080:1.4"
-        )
-    columns, rows = (int(n) for n in entry["size"])
-    fx = columns * entry["throw_ratio"]
-    if not 0.1 <= entry["throw_ratio"] <= 20:
-        raise InputError(
-            f"a throw ratio of {entry['throw_ratio']:g} is impossible: give distance over width, 0.1 to 20"
-        )
-    focal = (fx, fx / entry.get("row_pitch", 1.0))
-    return PlannedProjector(
-        (columns, rows), focal, entry["offset"], entry["aperture_mm"], entry["blur_px"], entry["black"]
-    ), entry["what"]
-
-
-def _read_devices(kind: Literal["camera", "projector"]) -> dict[str, dict[str, Any]]:
-    """Return the typical devices of a kind by name."""
-    devices: dict[str, dict[str, Any]] = tomllib.loads(asset("planning/devices.toml").read_text(encoding="utf-8"))[kind]
-    return devices
+        return {**known[typical], "size": [int(view[1]), int(view[2])]}, view
+    if text not in known:
+        raise InputError(f"no {kind} is called {text!r}: use {', '.join(known)}, or {notation}")
+    return known[text], None
 
 
 def _size(field: tuple[float, float]) -> str:
