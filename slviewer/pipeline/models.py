@@ -211,33 +211,31 @@ def recommended_model(store: Session) -> str:
     """The calibration that cross-validation recommends, where it was made for these; else splined or pixelwise, if it
     has 8 poses or more; else stereo.
     """
-    there = available_models(store)
-    if not there:
-        raise InputError(f"{store.folder} holds no calibration: run `slviewer calibrate` first")
-    compared = load_validation(store)
-    if compared is not None and compared.recommended in there:
-        return compared.recommended
-    for name in ("splined", "pixelwise"):
-        if name in there and len(store.load_result(f"calibration/{name}", only=())[0]["inputs"]) >= POSES_FOR_PIXELWISE:
-            return name
-    return there[0]
+    return _recommend(store)[0]
 
 
 def describe_default_model(session: SessionLike) -> str:
     """Which calibration commands use unless they name one, and why, as a line of text."""
     with opened(session) as store:
         name = preferred_model(store)
-        compared = load_validation(store)
-        fitted = [each for each in available_models(store) if each != "stereo"]
-        if name == store.decision("model"):
-            why = "chosen by the operator"
-        elif compared is not None and compared.recommended == name:
-            why = "recommended by the comparison on held-out poses"
-        elif name == "stereo" and fitted:
-            why = f"{' and '.join(fitted)} from fewer than {POSES_FOR_PIXELWISE} poses are used only by --model"
-        else:
-            why = f"made from {POSES_FOR_PIXELWISE} poses or more" if fitted else "the only one"
+        why = "chosen by the operator" if name == store.decision("model") else _recommend(store)[1]
     return f"default model: {name} ({why})"
+
+
+def _recommend(store: Session) -> tuple[str, str]:
+    """Return the name of the recommended calibration, and the reason in words. Raises InputError without any."""
+    there = available_models(store)
+    if not there:
+        raise InputError(f"{store.folder} holds no calibration: run `slviewer calibrate` first")
+    compared = load_validation(store)
+    if compared is not None and compared.recommended in there:
+        return compared.recommended, "recommended by the comparison on held-out poses"
+    for name in ("splined", "pixelwise"):
+        if name in there and len(store.load_result(f"calibration/{name}", only=())[0]["inputs"]) >= POSES_FOR_PIXELWISE:
+            return name, f"made from {POSES_FOR_PIXELWISE} poses or more"
+    if others := there[1:]:
+        return there[0], f"{' and '.join(others)} from fewer than {POSES_FOR_PIXELWISE} poses are used only by --model"
+    return there[0], "the only one"
 
 
 def load_validation(store: Session) -> CrossValidation | None:
