@@ -14,7 +14,7 @@ from slviewer.fringe.presets import PRESETS
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.geometry.rig import StereoRig
 from slviewer.pipeline.capture_phases import decode_frames
-from slviewer.pipeline.exposure_check import check_capture_exposure
+from slviewer.pipeline.exposure_check import warn_of_exposure
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings, part
 from slviewer.pipeline.frame_check import save_check
 from slviewer.pipeline.open_session import opened_or_made
@@ -120,9 +120,7 @@ def capture(
                 warn(f"{name}: {sentence}")
             if not captured.exposures_ms:  # of several, each is meant to be wrong somewhere
                 phases = decode_frames(name, sequence, captured.frames)
-                exposure = check_capture_exposure(sequence, captured.frames, phases)
-                if exposure.verdict != "good":
-                    warn(f"{name}: {exposure.sentence} {exposure.remedy}")
+                warn_of_exposure(name, sequence, captured.frames, phases, warn)
         except SlviewerError as error:  # it is saved, and can be looked at later
             warn(f"{name} is saved, and its frames could not be checked: {error}")
     progress(1.0, "captured")

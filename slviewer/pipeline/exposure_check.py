@@ -9,6 +9,7 @@ from slviewer.fringe.phase import PhaseMap, Reason
 from slviewer.fringe.residual_sample import select_rows
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.pipeline.check_results import Check, CheckVerdict
+from slviewer.pipeline.feedback import Warn
 
 CLIPPED, MUCH_CLIPPED = 0.005, 0.05
 """Shares of the illuminated pixels that are saturated: a warning, and bad."""
@@ -39,3 +40,12 @@ def check_capture_exposure(sequence: PatternSequence, frames: np.ndarray, phases
         verdict = "bad" if bright < TOO_WEAK * full else "warning"
         return Check("exposure", verdict, f"{sentence}.", "Raise the exposure, or open the aperture.", figures)
     return Check("exposure", "good", f"{sentence}; {100 * clipped:.1f} % of the pixels are saturated.", "", figures)
+
+
+def warn_of_exposure(
+    name: str, sequence: PatternSequence, frames: np.ndarray, phases: Mapping[Axis, PhaseMap], warn: Warn
+) -> None:
+    """Warn, with the capture's name, where `check_capture_exposure` finds it too bright or too dark."""
+    exposure = check_capture_exposure(sequence, frames, phases)
+    if exposure.verdict != "good":
+        warn(f"{name}: {exposure.sentence} {exposure.remedy}")

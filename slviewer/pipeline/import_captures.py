@@ -10,13 +10,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from slviewer.entry_points import IMPORTERS, explain_missing
 from slviewer.errors import InputError
 from slviewer.fringe.description_check import check_description
 from slviewer.fringe.origin import estimate_gray_origin
 from slviewer.fringe.sequence import PerAxis, parse_size
 from slviewer.pipeline.capture_phases import check_capture, decode_frames
-from slviewer.pipeline.exposure_check import check_capture_exposure
+from slviewer.pipeline.exposure_check import warn_of_exposure
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
 from slviewer.pipeline.frame_check import load_or_save_check
 from slviewer.pipeline.models import available_models
@@ -26,7 +25,7 @@ from slviewer.session.importers import guessed_description
 from slviewer.session.importers.guessed_description import GuessedDescription
 from slviewer.session.importers.images import Channel
 from slviewer.session.importers.imported import ImportableRecording, Imports, Skipped, none_usable
-from slviewer.session.importers.layouts import detect_layout, find_description, layouts
+from slviewer.session.importers.layouts import LAYOUT_PLUGINS, detect_layout, find_description, layouts
 from slviewer.session.layout import is_session
 from slviewer.session.reading import expand_user
 from slviewer.session.store import Session
@@ -127,7 +126,7 @@ def find_captures(
     known = layouts()
     if layout not in known:
         raise InputError(
-            f"the layout {layout!r} is unknown: use {', '.join(known)}{explain_missing(IMPORTERS, layout)}"
+            f"the layout {layout!r} is unknown: use {', '.join(known)}{LAYOUT_PLUGINS.explain_missing(layout)}"
         )
     size = known[layout].projector if projector is None else parse_size(projector)
     if layout == "frames":
@@ -284,7 +283,5 @@ def check_imported_capture(capture: NewCapture, warn: Warn) -> NewCapture:
             warn(f"{capture.name}: by the fringes, Gray code 0 begins at {listed}")
     phases = decode_frames(capture.name, sequence, capture.frames)
     check_capture(capture.name, sequence, capture.frames, phases)
-    exposure = check_capture_exposure(sequence, capture.frames, phases)
-    if exposure.verdict != "good":
-        warn(f"{capture.name}: {exposure.sentence} {exposure.remedy}")
+    warn_of_exposure(capture.name, sequence, capture.frames, phases, warn)
     return replace(capture, sequence=sequence)
