@@ -202,10 +202,12 @@ class Session(Decisions):
         self._require_writer()
         layout.raise_schema(self.folder)
         staged: dict[str, Path] = {}
+        taken = self.taken_names()
         try:
             for new in captures:
-                if new.name.lower() in map(str.lower, staged):
-                    raise InputError(f"two captures are named {new.name!r}, or alike: rename one of their folders")
+                if new.name in staged:
+                    raise InputError(f"two captures are named {new.name!r}: rename one of their folders")
+                new_name(new.name, (*taken, *staged))
                 replace = force if isinstance(force, bool) else new.name in force
                 staged[new.name] = self._stage(new, role, None if board is None else str(board), replace)
                 del new  # before the next one is made
@@ -463,8 +465,7 @@ class Session(Decisions):
 
     def _stage(self, capture: NewCapture, role: Role, board: str | None, force: bool) -> Path:
         """Write a capture next to its place, and return the folder, which `atomic.commit` renames."""
-        self._require_writer()
-        target = self._capture_folder(new_name(capture.name, self.taken_names()))
+        target = self._capture_folder(capture.name)
         if target.exists() and not force:
             raise InputError(
                 f"there is a capture {capture.name!r} already: choose another name, or replace it with --force"
