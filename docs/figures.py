@@ -35,8 +35,6 @@ BLOCK = re.compile(
 )
 NUMBER = re.compile(r"\d+(?:\.\d+)?")
 TOLERANCE = 0.02
-
-
 VALUE = re.compile(r"<!-- = (?P<name>[^\n>]+) -->(?P<number>[\d.]+)<!-- \. -->")
 REPRODUCE = "slviewer reproduce --quick"
 
