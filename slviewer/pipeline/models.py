@@ -20,6 +20,7 @@ from slviewer.pipeline.open_session import SessionLike, opened
 from slviewer.records import from_plain
 from slviewer.session.reading import decoding
 from slviewer.session.store import Session
+from slviewer.target.board import Board
 
 Model = StereoModel | PixelwiseModel | SplinedModel
 
@@ -236,6 +237,29 @@ def _recommend(store: Session) -> tuple[str, str]:
     if others := there[1:]:
         return there[0], f"{' and '.join(others)} from fewer than {POSES_FOR_PIXELWISE} poses are used only by --model"
     return there[0], "the only one"
+
+
+def find_target(store: Session) -> str:
+    """Return the board's notation: as chosen, else that of the calibration or of the poses; empty where unknown."""
+    decided = store.valid_decision("target")
+    if decided:
+        return str(decided)
+    stereo = None
+    with suppress(SessionError):  # a damaged calibration, which others name
+        stereo = load_stereo_if_complete(store)
+    if stereo is not None and stereo.board:
+        return stereo.board
+    return next((str(c.meta["board"]) for c in store.captures("calibration") if c.meta.get("board")), "")
+
+
+def explain_board(notation: str) -> str:
+    """Return why a stored board cannot be used, and what to do; empty where it can, or where there is none."""
+    try:
+        if notation:
+            Board.parse(notation)
+    except InputError as error:
+        return f"the target cannot be used: {error}; install the plugin that adds it, or choose another board"
+    return ""
 
 
 def load_validation(store: Session) -> CrossValidation | None:

@@ -1,6 +1,5 @@
 """Reads what a session's files contain, for the panels. Nothing is cached but what would be read again the same."""
 
-import contextlib
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -13,7 +12,7 @@ from slviewer.calibration.diagnosis.verdict import Verdict
 from slviewer.calibration.next_pose import outline_px
 from slviewer.calibration.observe import Observation
 from slviewer.calibration.stereo import StereoModel
-from slviewer.errors import DamagedError, InputError, SessionError
+from slviewer.errors import DamagedError, InputError
 from slviewer.fringe.presets import PRESETS
 from slviewer.inspection.parts import PartResult
 from slviewer.pipeline import align
@@ -22,6 +21,8 @@ from slviewer.pipeline.capture import DEFAULT_PATTERNS
 from slviewer.pipeline.models import (
     accepts_rejected,
     available_models,
+    explain_board,
+    find_target,
     load_stereo_if_complete,
     load_validation,
     preferred_model,
@@ -114,16 +115,9 @@ class SessionReader:
             self._unreadable[capture.name, capture.hash, self.target()] = why
 
     def target(self) -> str:
-        """Return the board's notation: as chosen, else that of the calibration or of the poses; empty where unknown."""
-        decided = self.session.valid_decision("target")
-        if decided:
-            return str(decided)
-        stereo = None
-        with contextlib.suppress(SessionError):  # a damaged calibration, which `read` names
-            stereo = load_stereo_if_complete(self.session)
-        if stereo is not None and stereo.board:
-            return stereo.board
-        return next((str(c.meta["board"]) for c in self.session.captures("calibration") if c.meta.get("board")), "")
+        """Return the board's notation, empty where it is unknown or a board of a plugin that is not installed."""
+        notation = find_target(self.session)
+        return "" if explain_board(notation) else notation
 
     def patterns(self) -> str:
         """Return the name of the pattern sequence."""
@@ -162,7 +156,8 @@ class SessionReader:
         """
         session, target = self.session, self.target()
         sound, faults = session.read_captures()
-        self._faults = [*faults.values(), *session.decision_faults()]
+        unknown = explain_board(find_target(session))
+        self._faults = [*faults.values(), *session.decision_faults(), *filter(None, [unknown])]
         captures = {capture.name: capture for capture in sound}
         calibration = self._attempt("the calibration", lambda: self._read_calibration(captures), None)
         models = calibration.models if calibration else ()

@@ -209,3 +209,15 @@ def test_a_deleted_pose_can_be_brought_back(operator: Operator) -> None:
     assert states(back) == {"pose_01": "good"} and not any(notice.level == "error" for notice in back.notices)
     operator.undelete("pose_01")
     assert "no deleted capture 'pose_01'" in last(operator.wait_until_idle())
+
+
+def test_a_session_whose_board_is_of_a_missing_plugin_is_opened_and_says_so(tmp_path: Path) -> None:
+    with Session.create(tmp_path / "session") as session:
+        session.decide("target", "aprilgrid:6x6:88")
+    with Operator(tmp_path / "session", RIG) as operator:
+        view = operator.wait_until_idle().session
+        assert view is not None and view.target == ""
+        assert any("aprilgrid:6x6:88" in fault and "plugin" in fault for fault in view.faults)
+        assert operator.choose_target(TARGET)
+        view = operator.wait_until_idle().session
+        assert view is not None and view.target == TARGET and not view.faults

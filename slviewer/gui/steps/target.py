@@ -67,12 +67,7 @@ class Panel(StepPanel):
             self._sheet.set("")
         if target != self._target:
             self._target = target
-            try:
-                self._board = Board.parse(target) if target else None
-            except InputError as error:  # of a plugin that is not installed here
-                self._board = None
-                self._note.set(alert(str(error), "error"))
-                return
+            self._board = Board.parse(target) if target else None
             if self._board is not None:
                 self._fill_fields(self._board)
         self._describe()
