@@ -1,5 +1,11 @@
-"""Example data: the shipped archive is unpacked whole, once, and only if it is what it says."""
+"""Example data: an archive is unpacked whole, once, and only if it is what it says; downloads are cached."""
 
+import hashlib
+import json
+import threading
+from collections.abc import Iterator
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import pytest
@@ -7,12 +13,53 @@ import pytest
 import slviewer as sl
 from slviewer.cli import main
 from slviewer.pipeline import datasets
+from slviewer.simulation.assets import asset
 
 
-def test_the_sample_is_unpacked_into_the_cache_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("SLVIEWER_DATASETS", str(tmp_path))
+@pytest.fixture(autouse=True)
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The folder of cached data sets."""
+    monkeypatch.setenv(datasets.CACHE, str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+class Files(SimpleHTTPRequestHandler):
+    """Serves a folder, and notes what was requested."""
+
+    requested: list[str]
+
+    def log_message(self, *_: object) -> None:
+        """Note the request's path."""
+        self.requested.append(self.path)
+
+
+@pytest.fixture
+def released(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
+    """A release on a server of the loopback address that offers the sample as ``letter``; yields what is requested."""
+    data = asset("datasets/sample.zip").read_bytes()
+    served = tmp_path / "served"
+    served.mkdir()
+    (served / "letter.zip").write_bytes(data)
+    Files.requested = []
+    server = ThreadingHTTPServer(("127.0.0.1", 0), partial(Files, directory=str(served)))
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    record = {
+        "url": f"http://127.0.0.1:{server.server_port}/letter.zip",
+        "sha256": hashlib.sha256(data).hexdigest(),
+        "bytes": len(data),
+    }
+    (tmp_path / "released.json").write_text(json.dumps({"letter": record}), "utf-8")
+    monkeypatch.setattr(
+        datasets, "asset", lambda name: tmp_path / "released.json" if name.endswith("released.json") else asset(name)
+    )
+    yield Files.requested
+    server.shutdown()
+    server.server_close()
+
+
+def test_the_sample_is_unpacked_into_the_cache_once(cache: Path) -> None:
     folder = sl.datasets.fetch("sample")
-    assert folder.parent == tmp_path and list(tmp_path.iterdir()) == [folder]
+    assert folder.parent == cache and list(cache.iterdir()) == [folder]
     assert len(sl.read_captures(folder / "poses")) == 6
     before = folder.stat().st_mtime_ns
     assert sl.datasets.fetch("sample") == folder and folder.stat().st_mtime_ns == before
@@ -27,12 +74,57 @@ def test_a_given_folder_is_made_and_never_overwritten(tmp_path: Path) -> None:
 def test_an_unknown_name_and_a_wrong_hash_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(sl.SlviewerError, match="sample"):
         sl.datasets.fetch("unknown")
+    with pytest.raises(sl.SlviewerError, match="make_sample_data"):
+        sl.datasets.fetch("letter")  # of a checkout, which is no release
     archive = tmp_path / "sample.zip"
-    archive.write_bytes(b"not what was packed")
+    archive.write_bytes(b"{}")  # also no released data set
     monkeypatch.setattr(datasets, "asset", lambda name: archive)
     with pytest.raises(sl.SlviewerError, match="hash"):
         sl.datasets.fetch("sample", tmp_path / "new")
     assert not (tmp_path / "new").exists()
+
+
+def test_a_released_data_set_is_downloaded_once(tmp_path: Path, released: list[str]) -> None:
+    shares: list[float] = []
+    folder = sl.datasets.fetch("letter", progress=lambda done, doing: shares.append(done))
+    assert len(sl.read_captures(folder / "poses")) == 6
+    assert len(shares) > 20 and shares == sorted(shares) and shares[-1] == pytest.approx(1)
+    assert sl.datasets.fetch("letter") == folder
+    assert (sl.datasets.fetch("letter", tmp_path / "copy") / "scan" / "sequence.toml").is_file()
+    assert len(released) == 1
+
+
+def test_a_cancelled_download_leaves_nothing_that_the_next_takes_for_whole(cache: Path, released: list[str]) -> None:
+    def cancel(done: float, doing: str) -> None:
+        if done > 0.3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        sl.datasets.fetch("letter", progress=cancel)
+    assert not [path for path in cache.iterdir() if path.suffix == ".zip"]
+    assert (sl.datasets.fetch("letter") / "poses").is_dir()
+
+
+def test_what_is_not_the_data_set_is_refused_and_not_cached(tmp_path: Path, cache: Path, released: list[str]) -> None:
+    (tmp_path / "served" / "letter.zip").write_bytes(b"another file")
+    with pytest.raises(sl.SlviewerError, match=r"letter\.zip.* hash"):
+        sl.datasets.fetch("letter")
+    assert not [path for path in cache.iterdir() if path.suffix == ".zip"]
+    (tmp_path / "served" / "letter.zip").unlink()
+    with pytest.raises(sl.SlviewerError, match="HTTPError"):
+        sl.datasets.fetch("letter")
+
+
+def test_without_a_network_the_message_names_address_and_way_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    record = {"letter": {"url": "http://127.0.0.1:9/letter.zip", "sha256": "0" * 64, "bytes": 1}}
+    (tmp_path / "released.json").write_text(json.dumps(record), "utf-8")
+    monkeypatch.setattr(datasets, "asset", lambda name: tmp_path / "released.json")
+    assert main(["fetch", "letter", str(tmp_path / "new")]) == 1
+    shown = " ".join(capsys.readouterr().err.split())
+    assert "http://127.0.0.1:9/letter.zip" in shown and "check the network" in shown and "sample" in shown
+    assert "Traceback" not in shown and not (tmp_path / "new").exists()
 
 
 def test_the_command_prints_the_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
