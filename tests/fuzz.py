@@ -62,9 +62,9 @@ COMMANDS = {
     ),
     "rig": ("capture S new --rig rig.toml --port 0", "preflight --rig rig.toml --port 0"),
     "frames": ("import frames images S2 --sequence frames.toml",),
-    "image": ("import frames images S2 --sequence frames.toml", "detect images/00.png --target circles:21x16:9"),
+    "image": ("import frames images S2 --sequence frames.toml", "detect board.png --target circles:21x16:9"),
     "artefact": ("accept S --artefact sphere.toml",),
-    "plan": ("inspect-parts plan.toml S --scans object_r1 --out parts",),
+    "plan": ("inspect-parts plan.toml S --scan object_r1 --out parts",),
     "nominal": ("compare S object_r1 part.stl", "compare S object_r1 part.obj", "compare S object_r1 part_2.ply"),
     "number": (
         "capture S new --rig rig.toml --port # --exposure-ms 10", "capture S new --rig rig.toml --exposure-ms #",
@@ -113,18 +113,19 @@ def make_seed(folder: Path) -> None:
             "check S pose_10",
             "merge S object_r1 object_r2 --reference object_r1",
             "align S object_r1 object_r2",
-            "measure S object_r1 point --at 160 120",
             "mesh S merge/1 --out part.stl --triangles 2000",
+            "edit S object_r1 --polygon 200 150 220 150 200 170",
+            "region S --roi=-500,500,-500,500,100,2000",
+            "measure S object_r1 point --at 160 120",
             "measure S object_r1 sphere --ball 0 0 500 150",
             "plan S --out plan.toml --tolerance 100",
-            "edit S object_r1 --polygon 160 120 190 120 160 150",
-            "region S --roi=-500,500,-500,500,100,2000",
             "export S calibration --out calibration.json --format json",
         ):
             faults.run_sound(command.split())
     with Session.open(session, write=True) as store:
         tasks.reconstruct_capture(store, "object_r1", None, Reporter(lambda: None), print)
         tasks.verify_captures(store, ["sphere_1"], "sphere", None, Reporter(lambda: None), print)
+        cv2.imwrite(str(folder / "board.png"), store.load_capture("pose_01").frames.max(0))
         store.exclude("pose_10", "blurred")
         store.decide("names", {"object_r1": "part"})
     part = trimesh.load(folder / "part.stl")
@@ -309,7 +310,7 @@ def damage(folder: Path, rng: random.Random) -> tuple[str, str, str]:
         texts = [path for path in files if path.suffix == ".json"]
         path = rng.choice(texts if rng.random() < 0.7 else files)
     elif kind == "image":
-        path = folder / "images" / "00.png"
+        path = folder / ("board.png" if command.startswith("detect") else "images/00.png")
     else:
         path = folder / (names.get(kind) or next(w for w in command.split() if w.startswith("part")))
     how = _damage_file(path, rng)
@@ -328,7 +329,7 @@ def _damage_file(path: Path, rng: random.Random) -> str:
         return "array"
     if path.suffix in (".stl", ".obj", ".ply") and "S" not in path.parts:
         content, how = damage_mesh(path, rng), "mesh"
-    elif path.suffix == ".png" and path.parent.name == "images":
+    elif path.suffix == ".png" and "S" not in path.parts:
         content, how = damage_image(path, rng), "image"
     elif path.suffix == ".json" and rng.random() < 0.75:
         content, how = json.dumps(damage_tree(json.loads(path.read_text()), rng)).encode(), "values"
