@@ -91,10 +91,10 @@ def main() -> None:
     """Render the data set that the command line names."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("name", nargs="?", choices=RECIPES, default="sample")
-    parser.add_argument("archive", nargs="?", type=Path, help="default: assets/datasets/NAME.zip")
+    parser.add_argument("archive", nargs="?", type=Path, help="default: assets/datasets/sample.zip, or letter.zip here")
     parser.add_argument("--release", metavar="URL", help="the folder of the release's files")
     options = parser.parse_args()
-    archive = options.archive or DATASETS / f"{options.name}.zip"
+    archive = options.archive or (DATASETS / "sample.zip" if options.name == "sample" else Path(f"{options.name}.zip"))
     render(options.name, archive)
     data = archive.read_bytes()
     if options.release:
