@@ -36,8 +36,9 @@ class CameraSettings:
 class Camera(Protocol):
     """Grabs single frames on request; `name`, `size` and `dtype` can be read before it is open.
 
-    One of more than 8 bits may also have a `full_scale`, the grey level at which it clips, such as 4095; without it the
-    bit depth is taken from the brightest pixel, and a dark image may pass for a bright one of fewer bits.
+    One of more than 8 bits may also have a `full_scale`, the grey level at which it clips, such as 4095. It can be read
+    before the camera is open, and is stored with its captures; without it the bit depth is taken from the brightest
+    pixel, and a dark image may pass for a bright one of fewer bits.
     """
 
     @property
@@ -87,7 +88,13 @@ class ColourCamera(Camera, Protocol):
 
 def find_full_scale(camera: Camera, largest: int) -> float:
     """Return the grey level at which a camera clips: its own statement, else by the largest level of an image."""
-    return float(getattr(camera, "full_scale", None) or clip_level(camera.dtype, largest))
+    return clip_level(camera.dtype, largest, stated_full_scale(camera))
+
+
+def stated_full_scale(camera: Camera) -> int | None:
+    """Return the grey level at which a camera states that it clips; None where it states none."""
+    stated = getattr(camera, "full_scale", None)
+    return None if stated is None else int(stated)
 
 
 _MAX_ANGLE_DEG = 1e5

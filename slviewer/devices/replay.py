@@ -39,6 +39,11 @@ class ReplayCamera(Openable):
         height, width = recording.played[0].shape[1:]
         self.size, self.dtype = (width, height), recording.played[0].dtype
 
+    @property
+    def full_scale(self) -> int | None:
+        """The grey level at which the recording's camera clipped; None where it is not known."""
+        return self._recording.played[1].full_scale
+
     def grab(self, out: np.ndarray) -> None:
         """Copy the recorded frame of the pattern shown; under even light of any level, the recorded texture."""
         self.check_open()

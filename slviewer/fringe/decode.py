@@ -31,7 +31,7 @@ def decode(
     check_stack(sequence, stack)
     layout = axis_layout(sequence, axis)
     stack = np.ascontiguousarray(stack)
-    white = white_level(stack, sequence.select(axis))
+    white = white_level(sequence, stack, sequence.select(axis))
     sequence, stack, factor = equalize_axis(sequence, stack, axis, light)
     if factor != 1:
         layout = axis_layout(sequence, axis)

@@ -96,7 +96,7 @@ def check_description(
         return ()
     light = estimate_frame_light(sequence, stack)
     if light.is_significant:
-        under_equal_light = find_contradictions(FrameReadings(sequence, equalize_frames(stack, light, sequence)[0]))
+        under_equal_light = find_contradictions(FrameReadings(*equalize_frames(sequence, stack, light)[:2]))
         is_explained = all(contradiction.cause != "unreadable" for contradiction in contradictions)
         # Misplaced frames distort the estimate of the light: an explanation of the frames as they are has priority.
         if not under_equal_light or not is_explained:

@@ -138,9 +138,9 @@ def estimate_frame_light(sequence: PatternSequence, stack: np.ndarray) -> FrameL
 
 
 def equalize_frames(
-    stack: np.ndarray, light: FrameLight, sequence: PatternSequence, frames: Sequence[int] | None = None
-) -> tuple[np.ndarray, float]:
-    """Scale frames to equal light: (k, h, w) uint16, and the factor by which grey levels were multiplied.
+    sequence: PatternSequence, stack: np.ndarray, light: FrameLight, frames: Sequence[int] | None = None
+) -> tuple[PatternSequence, np.ndarray, float]:
+    """Scale frames to equal light: their sequence, (k, h, w) uint16, and the factor that multiplied the grey levels.
 
     ``frames``: indices of the frames to scale, all if None. Phase-shifted frames are 65535 throughout at pixels that
     the camera clipped in one of the frames of their period, and nowhere else. Room light is added to the frames that
@@ -154,7 +154,7 @@ def equalize_frames(
     along_rows = values.albedo[:, :1] + values.albedo[:, 2:] * (np.arange(height) / (height - 1) - 0.5)
     offset, along_columns = values.uniform - values.uniform.max(), values.albedo[:, 1] - values.albedo[:, 1].max()
     along_rows = along_rows - along_rows.max(axis=0)
-    white = white_level(stack, chosen)
+    white = white_level(sequence, stack, chosen)
     albedo = np.zeros((0, 0), np.float32)
     highest = white - offset.min()
     if values.albedo.any():
@@ -173,7 +173,8 @@ def equalize_frames(
             clipped = np.maximum.reduce([stack[chosen[k]] for k in places]) >= white
             for k in places:
                 out[k][clipped] = CLIPPED
-    return out, scale
+    full_scale = None if sequence.full_scale is None else int(CLIPPED)
+    return replace(sequence, frames=tuple(sequence.frames[i] for i in chosen), full_scale=full_scale), out, scale
 
 
 def equalize_axis(
@@ -187,9 +188,7 @@ def equalize_axis(
     light = light or estimate_frame_light(sequence, stack)
     if not light.is_significant:
         return sequence, stack, 1.0
-    chosen = sequence.select(axis)
-    frames, scale = equalize_frames(stack, light, sequence, chosen)
-    return replace(sequence, frames=tuple(sequence.frames[i] for i in chosen)), frames, scale
+    return equalize_frames(sequence, stack, light, sequence.select(axis))
 
 
 def restore_levels(

@@ -18,18 +18,21 @@ from slviewer.errors import InputError
 from slviewer.fringe.layout import clip_level
 
 
-def merge_exposures(stacks: Sequence[np.ndarray], exposures: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
+def merge_exposures(
+    stacks: Sequence[np.ndarray], exposures: Sequence[float], full_scale: int | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """Merge one stack (n, h, w) per exposure: frames (n, h, w), and an index (h, w) uint8 into `exposures`.
 
     A pixel is from the longest exposure in which none of its frames is clipped, else from the shortest; exposures are
-    times in any unit and any order. Raises InputError where stacks and exposures do not fit.
+    times in any unit and any order; ``full_scale`` as in `clip_level`. Raises InputError where stacks and exposures do
+    not fit.
     """
     shapes = {(np.shape(stack), np.asarray(stack).dtype.str) for stack in stacks}
     if len(shapes) != 1 or len(stacks) != len(exposures) or stacks[0].ndim != 3:
         raise InputError(
             f"{len(exposures)} exposures and stacks of {sorted(shapes)}: give each one (n, h, w), all alike"
         )
-    choice = choose_exposure(np.stack([peaks(stack) for stack in stacks]), exposures)
+    choice = choose_exposure(np.stack([peaks(stack) for stack in stacks]), exposures, full_scale)
     frames, masks = np.empty_like(stacks[0], order="C"), chosen(choice, len(exposures))
     for k in range(len(frames)):
         pick([stack[k] for stack in stacks], masks, frames[k])
@@ -46,7 +49,7 @@ def peaks(frames: Iterable[np.ndarray]) -> np.ndarray:
     return largest
 
 
-def choose_exposure(highest: np.ndarray, exposures: Sequence[float]) -> np.ndarray:
+def choose_exposure(highest: np.ndarray, exposures: Sequence[float], full_scale: int | None = None) -> np.ndarray:
     """Return the index (h, w) uint8 into `exposures` of each pixel, from its `peaks` (k, h, w) in each of them."""
     if len(highest) != len(exposures) or not 0 < len(exposures) < 256 or min(exposures) <= 0:
         raise InputError(
@@ -54,7 +57,7 @@ def choose_exposure(highest: np.ndarray, exposures: Sequence[float]) -> np.ndarr
         )
     if len(set(exposures)) < len(exposures):
         raise InputError(f"exposures of {', '.join(f'{e:g}' for e in exposures)}: give each once")
-    white = clip_level(highest.dtype, int(highest.max()))
+    white = clip_level(highest.dtype, int(highest.max()), full_scale)
     order = np.argsort(exposures)
     choice = np.full(highest.shape[1:], order[0], np.uint8)
     for index in order[1:]:

@@ -1,7 +1,9 @@
 """Frame indices of one axis' pattern in a stack, and the conventions of its sequence."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -124,16 +126,27 @@ def check_stack(sequence: PatternSequence, stack: np.ndarray) -> None:
         raise InputError(f"{len(stack)} frames for a sequence of {len(sequence.frames)}: give one image for each frame")
 
 
-def white_level(stack: np.ndarray, indices: list[int]) -> float:
-    """Return the grey level at which the camera clips, derived from these frames as in `clip_level`."""
-    return clip_level(stack.dtype, 0 if stack.dtype == np.uint8 else max(int(stack[i].max()) for i in indices))
+def white_level(sequence: PatternSequence, stack: np.ndarray, indices: Sequence[int]) -> float:
+    """Return the grey level at which the camera clips: `clip_level` of these frames of a capture (n, h, w).
 
-
-def clip_level(dtype: np.dtype, largest: int) -> float:
-    """Return the grey level at which a camera clips: 255 for uint8, for uint16 the full scale of its bit depth.
-
-    ``largest``: largest grey level in the frames, from which the bit depth is derived.
+    Raises InputError for frames that contradict the full scale that the sequence states.
     """
+    stated = sequence.full_scale
+    largest = 0 if stack.dtype == np.uint8 and stated in (None, 255) else max(int(stack[i].max()) for i in indices)
+    if stated is not None and not largest <= stated <= np.iinfo(stack.dtype).max:
+        raise InputError(
+            f"full_scale is stated as {stated}, and the frames are {stack.dtype} and reach {largest}: correct it in "
+            "the description of the images or in the driver of the camera, then import or capture again"
+        )
+    return clip_level(stack.dtype, largest, stated)
+
+
+def clip_level(dtype: np.dtype, largest: int, full_scale: float | None = None) -> float:
+    """Return the grey level at which a camera clips: ``full_scale`` where it is stated, 255 for uint8, for uint16 the
+    full scale of the bit depth that ``largest``, the largest grey level in the frames, needs.
+    """
+    if full_scale is not None:
+        return float(full_scale)
     if dtype == np.uint8:
         return 255.0
     if largest in LEFT_ALIGNED_WHITE:
@@ -141,15 +154,19 @@ def clip_level(dtype: np.dtype, largest: int) -> float:
     return float(next(level for level in WHITE_LEVELS if level >= largest))
 
 
-def to_eight_bits(image: np.ndarray, largest: int | None = None) -> NDArray[np.uint8]:
+def to_eight_bits(image: np.ndarray, full_scale: float | None = None, largest: int | None = None) -> NDArray[np.uint8]:
     """Convert an image (h, w) or (h, w, 3), uint8 or uint16, to uint8: the upper eight of the camera's bits.
 
-    ``largest``: the largest grey level of the frame that it is a part of; None: its own.
+    ``full_scale`` as in `clip_level`; ``largest``: the largest grey level of the frame that the image is a part of,
+    None: its own.
     """
     if image.dtype == np.uint8:
         return image
-    white = clip_level(image.dtype, int(image.max(initial=0)) if largest is None else largest)
-    return (image >> (int(white).bit_length() - 8)).astype(np.uint8)
+    white = int(clip_level(image.dtype, int(image.max(initial=0)) if largest is None else largest, full_scale))
+    shift = max(white.bit_length() - 8, 0)
+    if white >> shift < 255:  # not all bits are used
+        return np.asarray(cv2.convertScaleAbs(image, alpha=255 / white), np.uint8)
+    return np.minimum(image >> shift, 255).astype(np.uint8)
 
 
 def _list_frames_by_bit(sequence: PatternSequence, axis: Axis, kind: Kind) -> tuple[int, ...]:

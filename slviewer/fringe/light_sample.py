@@ -83,7 +83,7 @@ def sample_light(
     frames = np.zeros((len(stack), len(row)), np.float32)
     for i in used:
         frames[i] = stack[i][row, column]
-    white = white_level(stack, used)
+    white = white_level(sequence, stack, used)
     run = columns[0] + np.arange(width - 2 * margin)
     rough = estimate_roughness(
         np.stack([stack[i][rows[::4, None], run] for i in used[:4]]).astype(np.float32), len(run)

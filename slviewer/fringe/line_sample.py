@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from slviewer.fringe import limits
-from slviewer.fringe.layout import white_level
+from slviewer.fringe.layout import clip_level
 from slviewer.fringe.residual_sample import estimate_roughness
 from slviewer.fringe.sequence import Axis, PatternSequence
 
@@ -52,17 +52,19 @@ class LineSample:
 
 def sample_lines(sequence: PatternSequence, stack: np.ndarray, pixels: int = PIXELS) -> LineSample:
     """Sample rows and columns of an (n, h, w) stack, spread evenly over the area that the patterns illuminate."""
-    return sample_frames(stack, coded_frames(sequence), pixels)
+    return sample_frames(stack, coded_frames(sequence), pixels, sequence.full_scale)
 
 
-def sample_frames(stack: np.ndarray, coded: list[int], pixels: int = PIXELS) -> LineSample:
+def sample_frames(
+    stack: np.ndarray, coded: list[int], pixels: int = PIXELS, full_scale: int | None = None
+) -> LineSample:
     """Sample rows and columns of an (n, h, w) stack whose frames ``coded`` show a pattern, see `sample_lines`."""
     height, width = stack.shape[1:]
     step = max(1, min(height, width) // GRID)
     grid = np.ascontiguousarray(stack[:, step // 2 :: step, step // 2 :: step])
     coded_grid = grid[coded]
     swing = (coded_grid.max(axis=0) - coded_grid.min(axis=0)).astype(np.float32)
-    white = white_level(grid, list(range(len(grid))))
+    white = clip_level(grid.dtype, int(grid.max()), full_scale)
     pattern = np.maximum(swing - 2 * limits.DARK_LEVELS * white / 255, 0)
     rows = _select_lines(pattern.sum(axis=1), step, height, round(pixels / width))
     columns = _select_lines(pattern.sum(axis=0), step, width, round(pixels / height / BLOCK))

@@ -38,7 +38,7 @@ def estimate_gray_origin(sequence: PatternSequence, stack: np.ndarray, axis: Axi
     layout = axis_layout(sequence, axis)
     light = estimate_frame_light(sequence, stack)
     if light.is_significant:
-        stack = equalize_frames(stack, light, sequence)[0]
+        sequence, stack, _ = equalize_frames(sequence, stack, light)
     if not (layout.shifts and layout.gray):
         raise InputError(
             f"axis {axis}: the origin of a Gray code shows only beside a phase shift: there is none to compare"

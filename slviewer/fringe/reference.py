@@ -30,7 +30,7 @@ def decode_reference(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -
     """Decode one axis without kernels, like `decode.decode`: same wrapped phase to 1e-5 rad, absolute to 1e-4 rad."""
     check_stack(sequence, stack)
     layout = axis_layout(sequence, axis)
-    full = white_level(stack, sequence.select(axis))
+    full = white_level(sequence, stack, sequence.select(axis))
     sequence, stack, factor = equalize_axis(sequence, stack, axis)
     if factor != 1:
         layout = axis_layout(sequence, axis)

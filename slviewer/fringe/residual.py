@@ -107,8 +107,8 @@ class _Frames:
     @cached_property
     def equalized(self) -> "_Frames":
         """The frames scaled to equal light."""
-        stack, factor = equalize_frames(self.stack, self.light, self.sequence)
-        return _Frames(FrameReadings(self.sequence, stack), self.light, factor)
+        sequence, stack, factor = equalize_frames(self.sequence, self.stack, self.light)
+        return _Frames(FrameReadings(sequence, stack), self.light, factor)
 
     @cached_property
     def contradictions(self) -> tuple[Contradiction, ...]:
@@ -117,7 +117,7 @@ class _Frames:
 
     def white(self, axis: Axis) -> float:
         """Return the grey level at which the frames of an axis are clipped."""
-        return CLIPPED if self.factor != 1 else white_level(self.stack, self.sequence.select(axis))
+        return CLIPPED if self.factor != 1 else white_level(self.sequence, self.stack, self.sequence.select(axis))
 
 
 def _measure_axis_residuals(frames: _Frames, axis: Axis) -> FrameResiduals:

@@ -29,7 +29,8 @@ MAX_STEPS = 1000
 MAX_EXTENT = 1 << 16
 """Columns and rows of a projector, px."""
 SEQUENCE_KEYS = (
-    "projector", "phase_sign", "phase_offset", "gray_origin", "gray_cell_px", "relative", "levels", "frame",
+    "projector", "phase_sign", "phase_offset", "gray_origin", "gray_cell_px", "relative", "levels", "full_scale",
+    "frame",
 )  # fmt: skip
 """The entries of `PatternSequence.to_dict`, and of a `frames` TOML."""
 
@@ -122,6 +123,8 @@ class PatternSequence:
     unambiguous range; otherwise it is refused. Without a projector size such an axis is always relative. ``levels``:
     for each grey level 0 ... 255 of a cosine the one that is shown in its place, so that a projector whose light is not
     proportional to it shows cosines; None where they are the same. It records what was shown; decoding does not use it.
+    ``full_scale``: grey level at which the camera clips, as the camera, the format or the operator states it, 4095 for
+    the 12 bits in a uint16; None: derived from the brightest pixel, see `layout.clip_level`.
 
     Raises InputError when steps or bits are missing, repeated, or contradict each other, or a value is out of range.
     """
@@ -134,6 +137,7 @@ class PatternSequence:
     phase_offset_rad: float | PerAxis[float] = 0.0
     gray_cell_px: float | PerAxis[float | None] | None = None
     relative: bool = False
+    full_scale: int | None = None
 
     def __post_init__(self) -> None:
         """Check the frames and conventions, and replace pairs of equal values by one value. Raises InputError."""
@@ -146,6 +150,8 @@ class PatternSequence:
                 object.__setattr__(self, name, value.x)
         for axis in get_args(Axis):
             self._check_values(axis)
+        if self.full_scale is not None and not 1 <= self.full_scale < 1 << 16:
+            raise InputError(f"full_scale is {self.full_scale}: give the level at which the camera clips, such as 4095")
         if self.levels is not None:
             _check_levels(self.levels)
         for axis in self.axes:
@@ -288,6 +294,8 @@ class PatternSequence:
             values["gray_cell_px"] = _convert_axes(self.gray_cell_px)
         if self.relative:
             values["relative"] = True
+        if self.full_scale is not None:
+            values["full_scale"] = self.full_scale
         return values
 
     @classmethod
@@ -301,6 +309,10 @@ class PatternSequence:
             raise InputError(f"levels is {levels!r}: give a list of 256 grey levels, or leave it out")
         if not isinstance(relative, bool):
             raise InputError(f"relative is {relative!r}: use true or false")
+        try:
+            full_scale = convert(data.get("full_scale"), int | None)
+        except ValidationError as error:
+            raise InputError(f"full_scale is {data['full_scale']!r}: give a whole number, such as 4095") from error
         return cls(
             None if data.get("projector") is None else parse_size(data["projector"]),
             tuple(Frame.from_dict(f) for f in frames),
@@ -310,6 +322,7 @@ class PatternSequence:
             _read_values(data, "phase_offset", 0.0, float),
             _read_values(data, "gray_cell_px", None, float),
             relative,
+            full_scale,
         )
 
 

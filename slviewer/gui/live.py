@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import viser
 
-from slviewer.fringe.layout import to_eight_bits
 from slviewer.gui.panel import PanelContext
 from slviewer.gui.scene import spacing, thin
 from slviewer.wizard.live_scan import LiveCloud
@@ -76,8 +75,7 @@ class LiveScreen:
         if not clients:
             return False
         self._adapt_limit()
-        grey = to_eight_bits(cloud.texture)
-        points, colours = thin(cloud.points, grey, self._limit)
+        points, colours = thin(cloud.points, cloud.texture, self._limit)
         self.points = len(points)
         if not len(points):
             return self._remove_cloud()

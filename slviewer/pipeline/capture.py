@@ -2,13 +2,14 @@
 
 import shutil
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from slviewer.devices.capture import CapturedFrames, capture_with_texture, check_exposures
-from slviewer.devices.protocols import CameraSettings, Rig
+from slviewer.devices.protocols import CameraSettings, Rig, stated_full_scale
 from slviewer.errors import InputError, SessionError, SlviewerError
 from slviewer.fringe.presets import PRESETS
 from slviewer.fringe.sequence import Axis, PatternSequence
@@ -149,11 +150,12 @@ def check_patterns(patterns: str) -> None:
 
 
 def choose_sequence(bench: RigSetup, patterns: str) -> PatternSequence:
-    """Return the sequence to project: the one of that name for the rig's projector, or the rig's only one."""
+    """Return the sequence to capture: the one of that name for the rig's devices, or the rig's only one."""
     if bench.reel is not None:
         return bench.reel.sequence
     check_patterns(patterns)
-    return PRESETS[patterns](bench.rig.projector.size)
+    shown = PRESETS[patterns](bench.rig.projector.size)
+    return replace(shown, full_scale=stated_full_scale(bench.rig.camera))
 
 
 def depth_axis(rig: StereoRig) -> Axis:

@@ -8,16 +8,15 @@ import numpy as np
 
 from slviewer.errors import InputError
 from slviewer.fringe.decode import decode, texture
-from slviewer.fringe.description_check import check_description
 from slviewer.fringe.frame_light import describe_disturbance, estimate_frame_light
 from slviewer.fringe.hdr import radiance, toned
-from slviewer.fringe.layout import axis_layout, white_level
+from slviewer.fringe.layout import axis_layout, to_eight_bits, white_level
 from slviewer.fringe.phase import PhaseMap, Reason
 from slviewer.fringe.reference import dark_limit, dark_sigmas
 from slviewer.fringe.scatter import SIGNIFICANT, measure_scatter
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.pipeline.feedback import Warn, ignore_warnings
-from slviewer.pipeline.frame_check import FrameCheck, load_check, load_or_save_check
+from slviewer.pipeline.frame_check import FrameCheck, describe_contradictions, load_check, load_or_save_check
 from slviewer.session.capture import Capture
 from slviewer.session.store import Session
 
@@ -77,12 +76,13 @@ def check_capture(
     frames: np.ndarray,
     phases: Mapping[Axis, PhaseMap],
     check: FrameCheck | None = None,
+    files: Sequence[str] = (),
 ) -> None:
     """Raise InputError where the frames (n, h, w) contradict their description, or next to nothing of them decodes.
 
-    ``check``: of these frames; without it, their description is compared here.
+    ``check``: of these frames; without it, their description is compared here. ``files``: names of the frames' files.
     """
-    contradictions = check.contradictions if check else check_description(sequence, frames)
+    contradictions = check.contradictions if check else describe_contradictions(sequence, frames, files)
     if contradictions:
         first, *others = contradictions
         alternatives = "".join(f". Or else: {c.message}" for c in others if c.axis == first.axis)
@@ -124,7 +124,7 @@ def loss_warnings(sequence: PatternSequence, frames: np.ndarray, phases: Mapping
         if not (phase.steps and phase.mask.any()):
             continue
         modulation, background = (float(np.median(m[phase.mask])) for m in (phase.modulation, phase.background))
-        white = white_level(frames, sequence.select(axis))
+        white = white_level(sequence, frames, sequence.select(axis))
         least = dark_limit(
             np.array([background], np.float32), phase.noise, white, dark_sigmas(axis_layout(sequence, axis))
         )
@@ -158,14 +158,19 @@ def scatter_warnings(phases: Mapping[Axis, PhaseMap]) -> list[str]:
     ]
 
 
-def capture_texture(capture: Capture, frames: np.ndarray) -> np.ndarray:
-    """Return the image of the scene under white light, (h, w) or (h, w, 3) uint8."""
+def capture_texture(capture: Capture, frames: np.ndarray, *, stretch: bool = True) -> np.ndarray:
+    """Return the image of the scene under white light, (h, w) or (h, w, 3) uint8.
+
+    ``stretch``: as `convert_to_8bit` does, in which boards are detected whatever the exposure; else 255 is the camera's
+    full scale where it is known, as for display.
+    """
     colour = capture.texture
     image = texture(capture.sequence, frames) if colour is None else colour
     choice = capture.exposure_choice
     if colour is None and choice is not None:
         return toned(radiance(image, choice, capture.exposures_ms))
-    return convert_to_8bit(image)
+    full_scale = capture.sequence.full_scale
+    return convert_to_8bit(image if stretch or full_scale is None else to_eight_bits(image, full_scale))
 
 
 def texture_8bit(sequence: PatternSequence, frames: np.ndarray) -> np.ndarray:

@@ -97,7 +97,7 @@ def check(
         progress(0.0, f"reading {capture}")
         frames = shot.stack()
         phases = decode_capture(shot, frames)
-        check_capture(capture, shot.sequence, frames, phases)
+        check_capture(capture, shot.sequence, frames, phases, files=shot.files)
         check_sizes(capture, shot.size, shot.sequence.projector_size, stereo.rig)
         board = Board.parse(stereo.board)
         observation = observe(

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from slviewer.devices.protocols import Camera, CameraSettings, Projector, Turntable
+from slviewer.devices.protocols import Camera, CameraSettings, Projector, Turntable, stated_full_scale
 from slviewer.errors import Cancelled, DetectionError, DeviceError, InputError, SlviewerError
 from slviewer.fringe.presets import complementary, phase_steps
 from slviewer.fringe.sequence import Frame, PatternSequence
@@ -50,6 +50,9 @@ def _inspect_camera(faults: list[str], camera: Camera) -> None:
         untouched = (frames[0] == _SEEN_LEVEL) & (frames[1] == _OTHER_LEVEL)
         if np.count_nonzero(untouched) > frame.size // 1000:  # some may have these levels in truth
             faults.append(f"grab left {np.count_nonzero(untouched)} of {frame.size} pixels as they were: fill them all")
+        largest, stated = int(np.max(frames)), stated_full_scale(camera)
+        if stated is not None and not largest <= stated <= np.iinfo(camera.dtype).max:
+            faults.append(f"full_scale is {stated}, and {camera.dtype} frames reach {largest}: state where they clip")
         wrong = np.zeros((height + 1, width), camera.dtype)
         faults += _expect(InputError, lambda: camera.grab(wrong), "grab into an array of another shape")
         other = np.zeros((height, width), np.float32)

@@ -108,7 +108,7 @@ def _whole_cloud(
     check_capture_sizes(store, [name])
     _, frames, phases = next(decode_captures(store, [name], warn))
     progress(0.4, f"reconstructing {name}")
-    texture = capture_texture(capture, frames)
+    texture = capture_texture(capture, frames, stretch=False)
     return capture_cloud(store, fitted, capture, phases, texture=texture, accept_rejected=accept_rejected, warn=warn)
 
 

@@ -19,7 +19,7 @@ WEAK, TOO_WEAK = 0.4, 0.12
 
 def check_capture_exposure(sequence: PatternSequence, frames: np.ndarray, phases: Mapping[Axis, PhaseMap]) -> Check:
     """Whether the frames (n, h, w) of a capture are too bright or too dark, by the pixels that see the patterns."""
-    full = float(white_level(frames, list(range(len(frames)))))
+    full = white_level(sequence, frames, range(len(frames)))
     illuminated = np.logical_or.reduce([phase.illuminated for phase in phases.values()])
     if not illuminated.any():
         return Check("exposure", "bad", "No pixel sees the patterns.", "Raise the exposure, or open the aperture.", {})

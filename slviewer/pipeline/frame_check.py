@@ -1,7 +1,8 @@
 """Whether the frames of a capture fit each other and their description: computed once, saved as `trust/<name>`."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -68,16 +69,47 @@ class FrameCheck:
 _FIGURES = tuple(name for name in FrameResidual.__annotations__ if name != "frame")
 
 
-def check_frames(sequence: PatternSequence, stack: np.ndarray) -> FrameCheck:
-    """Check the frames (n, h, w) of a capture."""
+_NUMBERED = re.compile(r"\b((?:frame|image)s? )(\d+(?:(?:, | and )\d+)*)\b(?! is missing)", re.IGNORECASE)
+
+
+def name_frames(text: str, sequence: PatternSequence, files: Sequence[str]) -> str:
+    """Return a message with the file after each number of a frame, counted from 1; unchanged where none are known.
+
+    ``files``: one a frame of every exposure in turn.
+    """
+    count = len(sequence.frames)
+
+    def name(number: re.Match[str]) -> str:
+        """Return the number with the frame's files."""
+        there = files[int(number[0]) - 1 :: count] if 0 < int(number[0]) <= count else ()
+        return f"{number[0]} ({' and '.join(there)})" if there else number[0]
+
+    return _NUMBERED.sub(lambda match: match[1] + re.sub(r"\d+", name, match[2]), text)
+
+
+def check_frames(sequence: PatternSequence, stack: np.ndarray, files: Sequence[str] = ()) -> FrameCheck:
+    """Check the frames (n, h, w) of a capture; messages name their ``files``, see `name_frames`."""
     readings = FrameReadings(sequence, stack)
-    residuals = capture_residuals(sequence, stack, readings)
-    return FrameCheck(tuple(residuals), check_description(sequence, stack, readings))
+    axes = [
+        replace(
+            axis, suspects=tuple(replace(s, sentence=name_frames(s.sentence, sequence, files)) for s in axis.suspects)
+        )
+        for axis in capture_residuals(sequence, stack, readings)
+    ]
+    return FrameCheck(tuple(axes), describe_contradictions(sequence, stack, files, readings))
+
+
+def describe_contradictions(
+    sequence: PatternSequence, stack: np.ndarray, files: Sequence[str], readings: FrameReadings | None = None
+) -> tuple[Contradiction, ...]:
+    """Return what `check_description` does, in messages that name the ``files`` of the frames."""
+    contradictions = check_description(sequence, stack, readings)
+    return tuple(replace(c, message=name_frames(c.message, sequence, files)) for c in contradictions)
 
 
 def save_check(session: Session, capture: Capture, frames: np.ndarray | None = None) -> FrameCheck:
     """Check a capture's ``frames`` (n, h, w), read here if None, and save the result in a writable session."""
-    check = check_frames(capture.sequence, capture.frames if frames is None else frames)
+    check = check_frames(capture.sequence, capture.frames if frames is None else frames, capture.files)
     if session.is_writable:
         meta = {"inputs": {capture.name: capture.hash}, "version": VERSION, **check.to_json()}
         session.save_result(f"trust/{capture.name}", meta, {})

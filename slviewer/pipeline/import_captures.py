@@ -11,13 +11,12 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from slviewer.errors import InputError
-from slviewer.fringe.description_check import check_description
 from slviewer.fringe.origin import estimate_gray_origin
 from slviewer.fringe.sequence import PerAxis, parse_size
 from slviewer.pipeline.capture_phases import check_capture, decode_frames
 from slviewer.pipeline.exposure_check import warn_of_exposure
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
-from slviewer.pipeline.frame_check import load_or_save_check
+from slviewer.pipeline.frame_check import describe_contradictions, load_or_save_check
 from slviewer.pipeline.models import available_models
 from slviewer.pipeline.open_session import SessionLike, opened, opened_or_made
 from slviewer.session.capture import NewCapture
@@ -272,7 +271,7 @@ def check_imported_capture(capture: NewCapture, warn: Warn) -> NewCapture:
         except InputError:
             # Frames out of order and changed light leave no common origin; name the cause.
             unstated = ("gray-origin", "phase-offset", "unreadable")
-            for contradiction in check_description(sequence, capture.frames):
+            for contradiction in describe_contradictions(sequence, capture.frames, capture.files):
                 if contradiction.cause not in unstated:
                     raise InputError(contradiction.message) from None
             raise
@@ -282,6 +281,6 @@ def check_imported_capture(capture: NewCapture, warn: Warn) -> NewCapture:
             listed = ", ".join(f"{origin:.2f} px along {axis}" for axis, origin in origins.items())
             warn(f"{capture.name}: by the fringes, Gray code 0 begins at {listed}")
     phases = decode_frames(capture.name, sequence, capture.frames)
-    check_capture(capture.name, sequence, capture.frames, phases)
+    check_capture(capture.name, sequence, capture.frames, phases, files=capture.files)
     warn_of_exposure(capture.name, sequence, capture.frames, phases, warn)
     return replace(capture, sequence=sequence)

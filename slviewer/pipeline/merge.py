@@ -240,7 +240,7 @@ def merge(
                 fitted,
                 shot,
                 phases,
-                texture=capture_texture(shot, frames),
+                texture=capture_texture(shot, frames, stretch=False),
                 accept_rejected=accept_rejected,
                 warn=warn,
             )

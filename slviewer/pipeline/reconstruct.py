@@ -142,8 +142,8 @@ def reconstruct(
         progress(0.1, "reading and decoding")
         shot, frames, decoded = next(decode_captures(store, [capture], warn, relative=True, check=check))
         phases = absolute_phases(store, capture, decoded, depth_range, warn)
-        texture = capture_texture(shot, frames)
         is_pose = shot.role == "calibration"
+        texture = capture_texture(shot, frames, stretch=is_pose)
         chosen = load_models(store, () if is_pose and model is None else (name,))
         progress(0.6, "reconstructing")
         clouds = {

@@ -55,7 +55,7 @@ def _measure_gains(store: Session, capture: Capture) -> np.ndarray:
     texture = capture.texture
     if texture is None:
         raise InputError(f"{capture.name} has no colours: name a capture of a colour camera with a white image")
-    texture = to_eight_bits(texture)
+    texture = to_eight_bits(texture, capture.sequence.full_scale)
     pixels = texture[_reference_mask(store, capture, texture)].astype(np.float64)
     brightness = pixels.max(axis=1)
     white = pixels[brightness >= np.quantile(brightness, 1 - WHITE_SHARE)]

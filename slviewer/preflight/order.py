@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from slviewer.devices.capture import capture
+from slviewer.devices.protocols import stated_full_scale
 from slviewer.fringe.presets import phase_steps
 from slviewer.fringe.residual import frame_residuals
 from slviewer.fringe.sequence import Frame, PatternSequence
@@ -27,7 +28,7 @@ def check_order(bench: RigUnderTest) -> tuple[Check, Check]:
         *phase_steps("x", _STEPS, max(4.0, projector[0] / _PERIODS)),
         *(levels[on] for on in _AFTER),
     )
-    sequence = PatternSequence(projector, frames)
+    sequence = PatternSequence(projector, frames, full_scale=stated_full_scale(bench.rig.camera))
     bench.show(None, "order of the frames")
     bench.wait()
     stack = capture(replace(bench.rig, settle_ms=bench.settle_ms), sequence)

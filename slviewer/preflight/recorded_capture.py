@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,13 +12,14 @@ from slviewer.errors import InputError
 from slviewer.fringe.layout import axis_layout, white_level
 from slviewer.fringe.phase import PhaseMap, Reason
 from slviewer.fringe.reference import dark_limit, dark_sigmas
-from slviewer.fringe.residual import FrameResiduals, capture_residuals
+from slviewer.fringe.residual import FrameResiduals
 from slviewer.fringe.response import measure_nonlinearity, predict_phase_error
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.pipeline.capture_phases import NEAR_DARK, check_capture, decode_frames
 from slviewer.pipeline.check_results import Check, CheckVerdict, Preflight
 from slviewer.pipeline.exposure_check import check_capture_exposure
 from slviewer.pipeline.feedback import Progress, ignore_progress
+from slviewer.pipeline.frame_check import FrameCheck, check_frames, name_frames
 from slviewer.preflight.light import MAX_NONLINEARITY
 from slviewer.preflight.order import check_repeats
 from slviewer.session.capture import Capture
@@ -43,11 +45,12 @@ def preflight_capture(capture: Capture, progress: Progress = ignore_progress) ->
         failed = Check("description", "bad", f"The frames cannot be decoded: {error}.", "Correct the description.", {})
         return Preflight((failed,), None, None, None, time.monotonic() - began)
     progress(0.5, "comparing the frames")
-    fits = capture_residuals(sequence, frames)
+    check = check_frames(sequence, frames, capture.files)
+    fits, repeats = check.axes, check_repeats(sequence, frames)
     checks = (
-        _check_description(capture.name, sequence, frames, phases),
+        _check_description(capture.name, sequence, frames, phases, check),
         _check_order(sequence, fits),
-        check_repeats(sequence, frames),
+        replace(repeats, sentence=name_frames(repeats.sentence, sequence, capture.files)),
         check_capture_exposure(sequence, frames, phases),
         _check_light(fits),
         _check_ambient_light(fits),
@@ -60,11 +63,11 @@ def preflight_capture(capture: Capture, progress: Progress = ignore_progress) ->
 
 
 def _check_description(
-    name: str, sequence: PatternSequence, frames: np.ndarray, phases: Mapping[Axis, PhaseMap]
-) -> Check:  # fmt: skip
+    name: str, sequence: PatternSequence, frames: np.ndarray, phases: Mapping[Axis, PhaseMap], check: FrameCheck
+) -> Check:
     """Check that the frames (n, h, w) agree with the description of their patterns."""
     try:
-        check_capture(name, sequence, frames, phases)
+        check_capture(name, sequence, frames, phases, check)
     except InputError as error:
         text = str(error).removeprefix(f"{name}: ")
         return Check("description", "bad", f"{text}.", "Correct the description of the capture, then import again.", {})
@@ -151,7 +154,7 @@ def _check_noise(sequence: PatternSequence, frames: np.ndarray, phases: Mapping[
         background, modulation = (float(np.median(values[valid])) for values in (phase.background, phase.modulation))
         noise = float(np.sqrt(phase.noise[0] + phase.noise[1] * background))
         sigma = float(np.median(phase.sigma_phase[valid])) * phase.period_px / (2 * np.pi)
-        white = white_level(frames, sequence.select(axis))
+        white = white_level(sequence, frames, sequence.select(axis))
         least = dark_limit(
             np.array([background], np.float32), phase.noise, white, dark_sigmas(axis_layout(sequence, axis))
         )

@@ -106,7 +106,7 @@ class OnePass:
         """Estimate noise and light levels of frames (n, h, w) from a sample of their pixels; of uint16 frames the
         largest grey level is searched in all of them."""
         self._check(frames)
-        white = white_level(frames, self.sequence.select(self.axis))
+        white = white_level(self.sequence, frames, self.sequence.select(self.axis))
         mean = fringe_mean(self._layout, frames) if self._layout.is_plain else MIDDLE
         return LightLevels(measure_noise(self._layout, frames, white), mean, white)
 
@@ -141,7 +141,7 @@ class OnePass:
             multiple=kernels.ROWS,
         )
         # a camera may turn out to have more bits than it seemed
-        if deep and clip_level(frames.dtype, int(peaks.max())) > scan.light.white:
+        if deep and clip_level(frames.dtype, int(peaks.max()), self.sequence.full_scale) > scan.light.white:
             return self.sweep(frames, self.light(frames), scan)
         return scan
 

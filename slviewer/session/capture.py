@@ -118,6 +118,11 @@ class Capture:
         return tuple(float(exposure) for exposure in self.meta.get("exposures_ms") or ())
 
     @property
+    def files(self) -> tuple[str, ...]:
+        """The files that an importer read, one a frame of every exposure in turn; empty of captures without files."""
+        return tuple(self.meta.get("files") or ())
+
+    @property
     def turn_step(self) -> TurnStep | None:
         """The step of a turn that it was captured at; None for other captures."""
         stored = self.meta.get("settings", {}).get("turntable")
@@ -128,7 +133,7 @@ class Capture:
         """(h, w) uint8: which of `exposures_ms` each pixel's frames are of; None for a single exposure."""
         if not self.exposures_ms:
             return None
-        return _choose_exposures(self.folder / "frames.zarr", self.exposures_ms, len(self.sequence.frames), self.hash)
+        return _choose_exposures(self.folder / "frames.zarr", self.exposures_ms, self.sequence, self.hash)
 
     def _merged(self, path: Path, indices: Sequence[int] | None) -> np.ndarray:
         """The merged frames (n, h, w) at `indices`; with one frame of each exposure in memory at most."""
@@ -136,7 +141,7 @@ class Capture:
         assert choice is not None
         wanted = list(range(n)) if indices is None else [int(index) for index in indices]
         if any(not 0 <= index < n for index in wanted):
-            raise InputError(f"frames {wanted} were requested, {self.name} has frames 0 to {n - 1}")
+            raise InputError(f"frames {wanted} were requested, {self.name} has {n} frames: count from 0")
         masks = chosen(choice, len(self.exposures_ms))
         stack = np.empty((len(wanted), *choice.shape), describe_stack(path)[1])
         for slot, index in enumerate(wanted):
@@ -188,6 +193,7 @@ class _Description:
     board: str | None = None
     texture: bool = False
     exposures_ms: list[Annotated[float, msgspec.Meta(gt=0, lt=1e9)]] = field(default_factory=list)
+    files: list[str] = field(default_factory=list)
     settings: dict[str, Any] = field(default_factory=dict)
 
 
@@ -195,7 +201,7 @@ class _Description:
 class NewCapture:
     """A capture in memory, to be saved: ``frames`` (n, h, w) uint8 or uint16 in the order of ``sequence``, or
     (k n, h, w) of the k ``exposures_ms``, one exposure after the other; ``texture`` (h, w, 3) RGB where the scene is
-    known in colour; ``source``: where it comes from."""
+    known in colour; ``source``: where it comes from; ``files``: of an import, relative to that, one a frame."""
 
     name: str
     sequence: PatternSequence
@@ -204,6 +210,7 @@ class NewCapture:
     source: str
     settings: Mapping[str, Any] = field(default_factory=dict)
     exposures_ms: Sequence[float] = ()
+    files: tuple[str, ...] = ()
 
     @property
     def hash(self) -> str:
@@ -220,7 +227,8 @@ class NewCapture:
         """(n, h, w): of several exposures, each pixel from the longest that did not clip it."""
         if not self.exposures_ms:
             return self.frames
-        return merge_exposures(np.split(self.frames, len(self.exposures_ms)), self.exposures_ms)[0]
+        stacks = np.split(self.frames, len(self.exposures_ms))
+        return merge_exposures(stacks, self.exposures_ms, self.sequence.full_scale)[0]
 
     def check(self) -> None:
         """Raise InputError unless frames, exposures and texture fit the sequence and one another."""
@@ -257,6 +265,7 @@ def write_capture(folder: Path, capture: NewCapture, role: Role, board: str | No
             "camera": {"size": [frames.shape[2], frames.shape[1]], "dtype": str(frames.dtype)},
             "frames": len(frames),
             **({"exposures_ms": exposures_ms} if exposures_ms else {}),
+            **({"files": capture.files} if capture.files else {}),
             "hash": _hash_content(frames_hash, described, exposures_ms, texture),
             "texture": texture is not None,
             "settings": capture.settings,
@@ -340,15 +349,19 @@ def _verify_once(folder: Path, content_hash: str, identity: object) -> None:
 
 
 @lru_cache(maxsize=4)
-def _choose_exposures(path: Path, exposures_ms: tuple[float, ...], n: int, content_hash: str) -> np.ndarray:
+def _choose_exposures(
+    path: Path, exposures_ms: tuple[float, ...], sequence: PatternSequence, content_hash: str
+) -> np.ndarray:
     """(h, w) uint8: the exposure of each pixel, from all frames of the stack; cached by its content."""
+    n = len(sequence.frames)
 
     def frames(exposure: int) -> Iterator[np.ndarray]:
         """Yield the frames (h, w) of one exposure, a few in memory at a time."""
         for first in range(0, n, _FRAMES_IN_MEMORY):
             yield from read_stack(path, range(exposure * n + first, exposure * n + min(first + _FRAMES_IN_MEMORY, n)))
 
-    choice = choose_exposure(np.stack([peaks(frames(e)) for e in range(len(exposures_ms))]), exposures_ms)
+    highest = np.stack([peaks(frames(e)) for e in range(len(exposures_ms))])
+    choice = choose_exposure(highest, exposures_ms, sequence.full_scale)
     if read_json(path.parent / "capture.json").get("hash") != content_hash:
         raise SessionError(f"capture {path.parent.name!r} was replaced while it was in use: load it again")
     choice.flags.writeable = False

@@ -61,7 +61,7 @@ def read_stack(path: Path, indices: Sequence[int] | None = None) -> np.ndarray:
     n = stack.shape[0]
     wanted = list(range(n)) if indices is None else [int(index) for index in indices]
     if any(not 0 <= index < n for index in wanted):
-        raise InputError(f"frames {wanted} were requested, {path.parent.name} has frames 0 to {n - 1}")
+        raise InputError(f"frames {wanted} were requested, {path.parent.name} has {n} frames: count from 0")
     for index in wanted:  # before memory is allocated for what the description announces
         stack.check_size(index)
     frames = np.empty((len(wanted), *stack.shape[1:]), stack.dtype)
@@ -215,7 +215,7 @@ class _StoredStack:
         """Return the error for a damaged frame, with the capture's name and the remedy."""
         capture, file = self.path.parent.name, self._chunk_path(index)
         return DamagedError(
-            f"{capture}: frame {index} of {self.shape[0]} is damaged ({file} {fault}): "
+            f"{capture}: frame {index + 1} of {self.shape[0]} is damaged ({file} {fault}): "
             "restore this file from a copy, or import or record the capture again"
         )
 

@@ -17,7 +17,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from slviewer.devices.capture import CapturedFrames, capture_with_texture
-from slviewer.devices.protocols import CameraSettings, Rig
+from slviewer.devices.protocols import CameraSettings, Rig, stated_full_scale
 from slviewer.errors import Cancelled, DeviceError, SlviewerError, TurntableError
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.pipeline.feedback import Progress
@@ -68,10 +68,13 @@ class _Task:
 class Acquisition:
     """Owns the devices and the queue of requests. Every method may be called from any thread, and returns at once.
 
-    `offer(frame)` gets every preview (h, w), a fresh array each, and must return at once too.
+    `offer(frame, full_scale)` gets every preview (h, w), a fresh array each, and what the camera states as its full
+    scale; it must return at once too.
     """
 
-    def __init__(self, notices: Notices, changed: Callable[[], None], offer: Callable[[np.ndarray], None]) -> None:
+    def __init__(
+        self, notices: Notices, changed: Callable[[], None], offer: Callable[[np.ndarray, int | None], None]
+    ) -> None:
         self._notices, self._changed, self._offer = notices, changed, offer
         self._condition = threading.Condition()
         self._requests: deque[CaptureRequest | _Task] = deque()
@@ -321,7 +324,7 @@ class Acquisition:
         width, height = rig.camera.size
         frame = np.empty((height, width), rig.camera.dtype)
         rig.camera.grab(frame)
-        self._offer(frame)
+        self._offer(frame, stated_full_scale(rig.camera))
 
     def _serve_stream(self, rig: Rig, stream: Stream) -> None:
         """Capture a stream's sequence once; aborted where something else is requested."""
@@ -341,7 +344,7 @@ class Acquisition:
             return
         if white is not None and time.monotonic() >= self._next_preview:
             self._next_preview = time.monotonic() + 1 / STREAM_PREVIEWS_PER_S
-            self._offer(white)
+            self._offer(white, stated_full_scale(rig.camera))
 
     def _serve_request(self, rig: Rig, request: CaptureRequest | _Task) -> None:
         """Execute a queued capture or task and report how it ended; a DeviceError is raised to the caller."""

@@ -14,6 +14,7 @@ import numpy as np
 
 from slviewer.errors import InputError
 from slviewer.fringe.decode import decode
+from slviewer.fringe.layout import to_eight_bits
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.geometry.rig import StereoRig
 from slviewer.pipeline.models import accepts_rejected, check_accepted, load_model, load_stereo, preferred_model
@@ -36,7 +37,8 @@ _RELOAD_S = 1.0  # between two checks whether the calibration has changed
 
 @dataclass(frozen=True, eq=False)
 class LiveCloud:
-    """One cloud on the camera's grid: points (h, w, 3) float32 mm, NaN where not measured, and texture (h, w).
+    """One cloud on the camera's grid: points (h, w, 3) float32 mm, NaN where not measured, and texture (h, w)
+    uint8.
 
     `begun`: the time of its first frame, by `time.monotonic`. Its arrays are never written again.
     """
@@ -155,7 +157,7 @@ class LiveModel:
             self._fast = one_pass(self.sequence, self.model, self.axis)
 
     def cloud(self, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Reconstruct frames (n, h, w): (points (h, w, 3) float32 mm, texture (h, w)), both new arrays.
+        """Reconstruct frames (n, h, w): (points (h, w, 3) float32 mm, texture (h, w) uint8), both new arrays.
 
         As in `reconstruct`, but what moved between the frames is NaN too. Raises InputError for frames of another
         sequence or camera.
@@ -174,7 +176,7 @@ class LiveModel:
         mask_motion(self.sequence, frames, self.axis, phase, modulation, noise, points)
         if self.factor != 1.0:
             points *= np.float32(self.factor)
-        return points, frames[-1].copy()
+        return points, np.array(to_eight_bits(frames[-1], self.sequence.full_scale))
 
     def _reuse_workspace(self) -> PassResult | None:
         """Return the previous result with new points, to reuse its other arrays; None at first."""

@@ -101,9 +101,9 @@ class Watcher:
         self._detector = LatestWorker("slviewer board detection", self._detect, _REST)
         self._viewer = LatestWorker("slviewer preview", self._make_preview)
 
-    def offer(self, frame: np.ndarray) -> None:
-        """Analyse `frame` (h, w) next, instead of any that is still waiting."""
-        self._viewer.offer(frame)
+    def offer(self, frame: np.ndarray, full_scale: int | None = None) -> None:
+        """Analyse `frame` (h, w) next, instead of any that is still waiting; `full_scale` is what the camera states."""
+        self._viewer.offer((frame, full_scale))
 
     def watch(self, target: Watch) -> None:
         """Set the board to detect from now on."""
@@ -114,10 +114,14 @@ class Watcher:
         self._viewer.close()
         self._detector.close()
 
-    def _make_preview(self, frame: np.ndarray) -> None:
-        """Reduce a frame (h, w), offer it for board detection, and publish a preview with the latest detection."""
+    def _make_preview(self, item: tuple[np.ndarray, int | None]) -> None:
+        """Reduce a frame (h, w), offer it for board detection, and publish a preview with the latest detection.
+
+        ``item``: the frame, and the full scale that the camera states.
+        """
         now = time.monotonic()
-        image, scale = reduced(frame)
+        frame, full_scale = item
+        image, scale = reduced(frame, full_scale=full_scale)
         if self._watch.board is not None:
             self._detector.offer((image, scale, now))
         if self._last:
@@ -128,7 +132,8 @@ class Watcher:
         if watch.board != self._watch.board:
             board, missing = None, ""
         rate = round(self._rate, 1)
-        self._analysed(PreviewView(self._number, image, scale, *brightness(frame), board, missing, None, rate))
+        light = brightness(frame, full_scale)
+        self._analysed(PreviewView(self._number, image, scale, *light, board, missing, None, rate))
 
     def _detect(self, item: tuple[np.ndarray, float, float]) -> None:
         """Detect the board in (reduced image, its scale, time in s), and store it, or why there is none.
@@ -170,11 +175,11 @@ class Stillness:
         self._pixels = None
 
 
-def reduced(frame: np.ndarray, longest_px: int = SEARCH_PX) -> tuple[np.ndarray, float]:
+def reduced(frame: np.ndarray, longest_px: int = SEARCH_PX, full_scale: int | None = None) -> tuple[np.ndarray, float]:
     """Reduce a frame (h, w) to uint8 with at most ``longest_px`` on its longer side; returns (image, scale)."""
     scale = min(1.0, longest_px / max(frame.shape))
     small = cv2.resize(frame, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else frame
-    return to_eight_bits(small, int(frame.max(initial=0))), scale
+    return to_eight_bits(small, full_scale, int(frame.max(initial=0))), scale
 
 
 def _differs(image: np.ndarray, before: np.ndarray) -> bool:
@@ -182,9 +187,9 @@ def _differs(image: np.ndarray, before: np.ndarray) -> bool:
     return image.shape != before.shape or float(np.percentile(cv2.absdiff(image, before), 99)) >= _UNCHANGED
 
 
-def brightness(frame: np.ndarray) -> tuple[float, float, np.ndarray]:
+def brightness(frame: np.ndarray, full_scale: int | None = None) -> tuple[float, float, np.ndarray]:
     """Return (share of saturated pixels, 99.5th percentile as a share of the range, histogram (64,) of shares)."""
-    top = clip_level(frame.dtype, int(frame.max(initial=0)))
+    top = clip_level(frame.dtype, int(frame.max(initial=0)), full_scale)
     some = frame[:: max(1, frame.shape[0] // 400), :: max(1, frame.shape[1] // 400)]
     by_level = np.bincount(some.ravel(), minlength=int(top) + 1)
     brightest = int(np.searchsorted(by_level.cumsum(), 0.995 * some.size))

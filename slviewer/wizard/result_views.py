@@ -190,5 +190,6 @@ def thumbnail(capture: Capture) -> bytes:
     if choice is not None:
         image = toned(radiance(image, choice, capture.exposures_ms))
     scale = THUMBNAIL_PX / max(image.shape)
-    small = to_eight_bits(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), int(image.max()))
+    small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    small = to_eight_bits(small, capture.sequence.full_scale, int(image.max()))
     return bytes(cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, 80])[1])

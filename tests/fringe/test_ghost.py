@@ -19,7 +19,7 @@ LIGHT, RENDERER = render_light(RIG, blank_board(Pose(np.eye(3), np.array([0.0, 0
 
 def sampled(fault=None, severity="mild", axis="y"):
     frames = expose_frames(RIG, LIGHT, SEQUENCE, RENDERER.room_light(), 0, FAULTS[fault] if fault else None, severity)
-    layout, white = axis_layout(SEQUENCE, axis), white_level(frames, SEQUENCE.select(axis))
+    layout, white = axis_layout(SEQUENCE, axis), white_level(SEQUENCE, frames, SEQUENCE.select(axis))
     return sample_fringe(frames, layout.shifts[-1], measure_noise(layout, frames, white), white)
 
 

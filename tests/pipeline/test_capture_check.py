@@ -58,7 +58,7 @@ def seen(decoded: float, otherwise: Reason) -> PhaseMap:
 def test_a_capture_of_which_next_to_nothing_decodes_is_refused(
     decoded: float, otherwise: Reason, facts: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(capture_phases, "check_description", lambda sequence, frames: ())
+    monkeypatch.setattr(capture_phases, "describe_contradictions", lambda *_: ())
     phases = {"x": seen(decoded, otherwise)}
     frames = np.zeros((len(SEQUENCE.frames), 40, 40), np.uint8)
     if not facts:

@@ -86,6 +86,10 @@ class Nameless(Camera):
         Openable.__init__(self, "")
 
 
+class UnderstatesItsFullScale(Camera):
+    full_scale = 64
+
+
 def test_a_good_camera_has_no_fault():
     assert check_camera(Camera()) == []
     rig = simulated_rig(SimulatedWorld(letter(0.1)))
@@ -101,6 +105,7 @@ def test_a_good_camera_has_no_fault():
         (NeverClosed(), "use before open raises nothing"),
         (CloseRaises(), "the library is gone"),
         (AppliesNothing(), "apply does not return CameraSettings"),
+        (UnderstatesItsFullScale(), "full_scale is 64"),
         (Nameless(), "name is empty"),
         (Nameless(), "dtype is 'uint16'"),
     ],

@@ -50,7 +50,7 @@ def test_a_damaged_frame_is_named_and_never_used(session, sequence, frames, dama
     damage_file(capture.folder / "frames.zarr" / "c.2.0.0", damage)
     for read in (lambda: capture.frames, lambda: capture.stack([0, 2]), capture.verify):
         with pytest.raises(
-            DamagedError, match=r"^pose_03: frame 2 of 4 is damaged \(.*c\.2\.0\.0 .*\): restore .* import"
+            DamagedError, match=r"^pose_03: frame 3 of 4 is damaged \(.*c\.2\.0\.0 .*\): restore .* import"
         ):
             read()
     np.testing.assert_array_equal(capture.stack([0, 1, 3]), frames[[0, 1, 3]])
@@ -59,7 +59,7 @@ def test_a_damaged_frame_is_named_and_never_used(session, sequence, frames, dama
 def test_a_damaged_frame_of_several_exposures_is_named(session, sequence, noise):
     capture = session.save_capture("a", "scan", sequence, noise(1, 8), source="", exposures_ms=(2.0, 8.0))
     damage_file(capture.folder / "frames.zarr" / "c.5.0.0", "zeros inside")
-    with pytest.raises(DamagedError, match=r"^a: frame 5 of 8 is damaged"):
+    with pytest.raises(DamagedError, match=r"^a: frame 6 of 8 is damaged"):
         _ = capture.frames
 
 
@@ -131,7 +131,7 @@ def test_a_damaged_pose_is_refused_and_the_others_are_read(session, sequence, fr
     judged = list(poses.read_stored_poses(session, session.capture_names(), None, None))
     assert [pose.name for pose in judged] == ["pose_1", "pose_2", "pose_3"]
     assert [pose.refused for pose in judged][::2] == ["sound", "sound"]
-    assert judged[1].refused.startswith("frame 1 of 4 is damaged")
+    assert judged[1].refused.startswith("frame 2 of 4 is damaged")
 
 
 @pytest.fixture
@@ -190,7 +190,7 @@ def test_check_reads_everything_and_lists_what_is_damaged(session, sequence, fra
     with pytest.raises(DamagedError) as damage:
         inspect(session.folder, check=True)
     lines = str(damage.value).splitlines()[1:]
-    named = ["captures/c/capture.json", "decisions.json", "b: frame 3 of 4", "clouds/a", "clouds/b"]
+    named = ["captures/c/capture.json", "decisions.json", "b: frame 4 of 4", "clouds/a", "clouds/b"]
     assert len(lines) == len(named) and all(name in line for name, line in zip(named, lines, strict=True))
 
 

@@ -33,7 +33,7 @@ class Bench:
         self.notices = Notices(lambda: None)
         self.previews: list[np.ndarray] = []
         self.saved: list[tuple[str, np.ndarray, CameraSettings]] = []
-        self.acquisition = Acquisition(self.notices, lambda: None, self.previews.append)
+        self.acquisition = Acquisition(self.notices, lambda: None, lambda frame, _: self.previews.append(frame))
         self.rig: Rig
         self.faults: Faults
         self.rig, self.faults = breakable(simulated_rig(WORLD))

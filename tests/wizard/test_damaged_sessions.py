@@ -125,7 +125,7 @@ def test_a_damaged_pose_is_refused_by_name(folder: Path) -> None:
         operator.wait_until_idle(30)
         shown = operator.wait_for(lambda s: bool(s.pose("pose_02")) and s.pose("pose_02").state == "refused", 30)  # type: ignore[union-attr]
         assert shown is not None
-        assert "frame 1 of 4 is damaged" in shown.pose("pose_02").why  # type: ignore[union-attr]
+        assert "frame 2 of 4 is damaged" in shown.pose("pose_02").why  # type: ignore[union-attr]
 
 
 def test_the_reason_why_the_wizard_cannot_start_is_stated(folder: Path) -> None:

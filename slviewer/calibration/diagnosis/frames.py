@@ -57,7 +57,7 @@ def measure_second_harmonic(sequence: PatternSequence, stack: np.ndarray, axis: 
     indices = layout.shifts[-1].indices
     rows = select_rows(*stack.shape[1:])
     frames = np.stack([stack[i][rows].ravel() for i in indices])
-    white = white_level(stack, list(indices))
+    white = white_level(sequence, stack, indices)
     frames = frames[:, (frames.max(0) < white) & (frames.min(0) > 0)].astype(np.float32)
     n = len(indices)
     first, second = (
@@ -87,7 +87,7 @@ def measure_period(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -> 
     size = stack.shape[2 if axis == "y" else 1]
     step = max(1, size // ORIGIN_ROWS)
     thin = np.ascontiguousarray(stack[:, :, ::step] if axis == "y" else stack[:, ::step])
-    origin = _measure_code_origin(layout, thin, white_level(stack, sequence.select(axis)))
+    origin = _measure_code_origin(layout, thin, white_level(sequence, stack, sequence.select(axis)))
     turns = layout.gray_origin_px / layout.period_px
     ratio = turns / origin if np.isfinite(origin) and abs(origin) > 1e-3 else np.nan
     return float(layout.period_px * ratio) if 0.1 < ratio < 10 else np.nan

@@ -7,6 +7,7 @@ phase_offset = 0.0       # rad; this and the others may differ by axis: {x = 0.0
 gray_origin = -0.5       # projector px at which Gray code 0 begins
 gray_cell_px = 18.0      # width of the cells that the Gray bits number; by default the longest period, or 1 px without
 relative = false         # true: steps alone whose periods do not cover the projector; the phase is not absolute
+full_scale = 4095        # grey level at which a camera of more than 8 bits clips; by default as the files state it
 channel = "green"        # of colour images: red, green (the default), blue, luma or max
 
 [[frame]]                # one image

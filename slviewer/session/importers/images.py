@@ -25,22 +25,27 @@ MAX_PIXELS = 160_000_000
 _THREADS = 4  # decoding releases the interpreter
 _PNG = b"\x89PNG\r\n\x1a\n"
 _JPEG = b"\xff\xd8"
+_NETPBM = re.compile(rb"P[1-7]" + 2 * rb"(?:\s|#[^\n]*\n)+(\d{1,9})" + rb"(?:(?:\s|#[^\n]*\n)+(\d{1,5})\s)?")
 
 
 @dataclass(frozen=True)
 class FrameImages:
     """Image files as frames of one channel. ``in_colour``: whether the files hold colours, of which one channel was
-    used."""
+    used. ``full_scale``: the grey level at which their camera clipped, None where neither file nor caller states it."""
 
     stack: np.ndarray  # (n, h, w) uint8 or uint16
     texture: np.ndarray | None  # (h, w, 3) RGB of the frame that was asked for, where it is in colour
     in_colour: bool
+    full_scale: int | None
 
 
 def read_frames(
-    paths: Sequence[Path], colour_frame: int | None = None, channel: Channel = DEFAULT_CHANNEL
+    paths: Sequence[Path],
+    colour_frame: int | None = None,
+    channel: Channel = DEFAULT_CHANNEL,
+    full_scale: int | None = None,
 ) -> FrameImages:
-    """The frames of image files, and the colours of frame `colour_frame` if it has any.
+    """The frames of image files, and the colours of frame `colour_frame` if it has any; `full_scale` where it is known.
 
     Colour frames are reduced to one channel, by default green: a colour camera samples it most densely, and unlike a
     mixture it stays linear up to the level at which it saturates, which decoding can see. Raises InputError, naming the
@@ -63,27 +68,50 @@ def read_frames(
         if image.ndim == 2:
             stack[index] = image
             return
-        stack[index] = reduce_channels(image, channel)
+        stack[index] = reduce_channels(image, channel, full_scale)
         in_colour[index] = not _is_grey(image)
         if index == colour_frame and in_colour[index]:
             texture.append(cv2.cvtColor(image, cv2.COLOR_BGR2RGB))
 
     with ThreadPoolExecutor(_THREADS) as pool:
         list(pool.map(read, range(len(paths))))
-    return FrameImages(stack, texture[0] if texture else None, bool(in_colour.any()))
+    if full_scale is None and stack.dtype == np.uint16:
+        full_scale = _stated_full_scale(paths[0], stack)
+    return FrameImages(stack, texture[0] if texture else None, bool(in_colour.any()), full_scale)
 
 
-def reduce_channels(image: np.ndarray, channel: Channel) -> np.ndarray:
+def _stated_full_scale(path: Path, stack: np.ndarray) -> int | None:
+    """Return the full scale that the first of the files states; None where its format states none.
+
+    A PGM states its largest grey level, which many programs leave at 65535. A PNG may state the number of significant
+    bits: by its standard the upper ones, but programs that leave the bits at the bottom write it too. The tags of a
+    TIFF state the extremes of its own pixels.
+    """
+    data, largest = read_file(path, MAX_IMAGE_BYTES)[:4096], int(stack.max())
+    at = data.find(b"sBIT") if data.startswith(_PNG) else -1
+    bits = data[at + 4] if at > 0 else 0
+    if netpbm := _NETPBM.match(data):
+        bits = (int(netpbm[3] or 0) + 1).bit_length() - 1
+    if not 8 < bits < 16:
+        return None
+    full_scale = (1 << bits) - 1
+    if netpbm:
+        return full_scale if largest <= full_scale == int(netpbm[3]) else None
+    return full_scale if largest <= full_scale else full_scale << (16 - bits)
+
+
+def reduce_channels(image: np.ndarray, channel: Channel, full_scale: int | None = None) -> np.ndarray:
     """(h, w) of a (h, w, 3) BGR image, of its dtype.
 
     luma is that of ITU-R BT.601, and full scale where one of the channels saturates: the mixture would hide it.
+    ``full_scale`` as in `clip_level`.
     """
     if channel == "max":
         return image.max(axis=2)
     if channel != "luma":
         return image[..., ("blue", "green", "red").index(channel)]
     luma = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
-    white = clip_level(image.dtype, int(image.max()))
+    white = clip_level(image.dtype, int(image.max()), full_scale)
     luma[(image >= white).any(axis=2)] = white
     return luma
 
@@ -173,7 +201,7 @@ def _announced_size(data: bytes) -> tuple[int, int]:
     if data.startswith(b"BM") and len(data) >= 26:
         width, height = struct.unpack_from("<ii", data, 18)
         return abs(width), abs(height)
-    if netpbm := re.match(rb"P[1-7](?:\s+|#[^\n]*\n)+(\d{1,9})(?:\s+|#[^\n]*\n)+(\d{1,9})", data[:1000]):
+    if netpbm := _NETPBM.match(data[:1000]):
         return int(netpbm[1]), int(netpbm[2])
     if data.startswith((b"II*\0", b"MM\0*")) and len(data) >= 8:
         return _tiff_size(data)

@@ -3,7 +3,7 @@
 import os
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -34,11 +34,15 @@ class ImportableRecording:
         channel of colour frames was taken."""
         channel = self.channel or DEFAULT_CHANNEL
         shown, middle = _colour_frame(self.sequence), len(self.exposures_ms) // 2 * len(self.sequence.frames)
-        images = read_frames(self.files, None if shown is None else shown + middle, channel)
+        colour_frame = None if shown is None else shown + middle
+        images = read_frames(self.files, colour_frame, channel, self.sequence.full_scale)
         settings = {**self.settings, "channel": channel} if images.in_colour else self.settings
+        sequence = replace(self.sequence, full_scale=images.full_scale)
+        files = [file.relative_to(self.source) if file.is_relative_to(self.source) else file for file in self.files]
         return NewCapture(
-            self.name, self.sequence, images.stack, images.texture, str(self.source), settings, self.exposures_ms
-        )
+            self.name, sequence, images.stack, images.texture, str(self.source), settings, self.exposures_ms,
+            tuple(file.as_posix() for file in files),
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
