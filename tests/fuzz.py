@@ -53,16 +53,17 @@ COMMANDS = {
         "inspect S", "report S --out r.html", "reconstruct S object_r1 --out c.ply", "decode S pose_01 --out d.npz",
         "measurements S", "measurements S --csv m.csv", "export S calibration --out e.json",
         "verify S object_r1 --shape plane",
-        "check S pose_01", "validate S", "mesh S merge/1 --out m.stl",
+        "check S pose_01", "inspect S --check", "validate S", "mesh S merge/1 --out m.stl",
         "merge S object_r1 object_r2 --reference object_r1 --out m.ply",
         "calibrate S --target circles:21x16:9 --models stereo pixelwise", "measure S object_r1 point --at 160 120",
         "compare S object_r1 part.stl",
         "import opencv-calibration calibration.json S --force", "preflight --capture S object_r1",
-        "edit S object_r1", "region S", "plan S --out p.toml",
+        "edit S object_r1", "region S", "plan S --out p.toml", "align S object_r1 object_r2", "restore S calibration/*",
     ),
     "rig": ("capture S new --rig rig.toml --port 0", "preflight --rig rig.toml --port 0"),
     "frames": ("import frames images S2 --sequence frames.toml",),
     "image": ("import frames images S2 --sequence frames.toml", "detect board.png --target circles:21x16:9"),
+    "opencv": tuple(f"import opencv-calibration calibration.{suffix} S --force" for suffix in ("yml", "xml", "json")),
     "artefact": ("accept S --artefact sphere.toml",),
     "plan": ("inspect-parts plan.toml S --scan object_r1 --out parts",),
     "nominal": ("compare S object_r1 part.stl", "compare S object_r1 part.obj", "compare S object_r1 part_2.ply"),
@@ -120,6 +121,7 @@ def make_seed(folder: Path) -> None:
             "measure S object_r1 sphere --ball 0 0 500 150",
             "plan S --out plan.toml --tolerance 100",
             "export S calibration --out calibration.json --format json",
+            "export S calibration --out calibration.xml",
         ):
             faults.run_sound(command.split())
     with Session.open(session, write=True) as store:
@@ -299,7 +301,7 @@ def _flip(data: bytes, rng: random.Random) -> bytes:
 
 def damage(folder: Path, rng: random.Random) -> tuple[str, str, str]:
     """Damage one file in a copy of the seed; returns the kind of file, what was done, and the command to run."""
-    kind = rng.choice(("session",) * 6 + ("rig", "frames", "image", "artefact", "plan", "nominal", "number"))
+    kind = rng.choice(("session",) * 6 + ("rig", "frames", "image", "opencv", "artefact", "plan", "nominal", "number"))
     command = rng.choice(COMMANDS[kind])
     if kind == "number":
         numbers = (*NUMBERS, "-0", "1e308", "-1e308", "1e-320", "0.5", "9" * 5000, "1_0", "٣", "0x10", "")
@@ -312,7 +314,7 @@ def damage(folder: Path, rng: random.Random) -> tuple[str, str, str]:
     elif kind == "image":
         path = folder / ("board.png" if command.startswith("detect") else "images/00.png")
     else:
-        path = folder / (names.get(kind) or next(w for w in command.split() if w.startswith("part")))
+        path = folder / (names.get(kind) or next(w for w in command.split() if w.startswith(("part", "calibration"))))
     how = _damage_file(path, rng)
     if kind == "session":
         parts = path.relative_to(folder / "S").parts
@@ -333,7 +335,7 @@ def _damage_file(path: Path, rng: random.Random) -> str:
         content, how = damage_image(path, rng), "image"
     elif path.suffix == ".json" and rng.random() < 0.75:
         content, how = json.dumps(damage_tree(json.loads(path.read_text()), rng)).encode(), "values"
-    elif path.suffix in (".json", ".toml"):
+    elif path.suffix in (".json", ".toml", ".yml", ".xml"):
         content, how = damage_text(path.read_text(), rng), "text"
     else:
         content, how = damage_bytes(path.read_bytes(), rng), "bytes"

@@ -332,9 +332,9 @@ def parse_size(text: Any) -> tuple[int, int]:
     try:
         width, height = convert(parts, tuple[int, int], strict=False)
     except ValidationError as error:
-        raise InputError(f"'{text}' is no projector size: write width and height like 912x1140") from error
+        raise InputError(f"'{text}' is no size: write width and height in px like 912x1140") from error
     if not (1 <= width <= MAX_EXTENT and 1 <= height <= MAX_EXTENT):
-        raise InputError(f"'{text}' is no projector size: write width and height like 912x1140")
+        raise InputError(f"'{text}' is no size: write width and height in px like 912x1140")
     return width, height
 
 

@@ -5,16 +5,15 @@ A certificate names the hash of every frame, capture and result and the versions
 
 import html
 import platform
-import re
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypedDict
 
 import msgspec
 import numpy as np
@@ -22,6 +21,7 @@ import numpy as np
 from slviewer import __version__
 from slviewer.calibration.pixelwise import PixelwiseModel
 from slviewer.calibration.splined.model import SplinedModel
+from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import InputError, SlviewerError
 from slviewer.evaluation.render import format_count
 from slviewer.inspection.regions import Region
@@ -42,11 +42,11 @@ from slviewer.pipeline.open_session import SessionLike, numbered_results, opened
 from slviewer.pipeline.scale import load_scale_correction
 from slviewer.pipeline.verify import verify
 from slviewer.records import from_plain
-from slviewer.report.page import CERTIFICATE, Column, Section, Table, page_digest
+from slviewer.report.page import CERTIFICATE, Column, Section, Table, page_digest, split_page
 from slviewer.session.decisions import REGION_INPUT
 from slviewer.session.measurements import Measurement
 from slviewer.session.nominal import NOMINALS, read_nominal
-from slviewer.session.reading import expand_user, read_file
+from slviewer.session.reading import MAX_JSON_BYTES, expand_user, read_file
 from slviewer.session.scan_edits import load_edits, load_region, restriction_inputs, save_edits, save_region
 from slviewer.session.store import Session
 
@@ -57,7 +57,7 @@ RELATIVE = 1e-3
 """Difference of a figure, as a share of it, up to which it is the same: other processors round otherwise."""
 ABSOLUTE = 2e-6
 """... and in the figure's own unit, mm or px."""
-_MAX_REPORT_BYTES = 1 << 29
+_MAX_REPORT_BYTES = 1 << 28
 FRAMES = "frames of "
 _BY_OPERATOR = ("excluded by the operator", "not among the poses", "excluded for this calibration")
 
@@ -72,14 +72,22 @@ IN_WORDS: Mapping[State, str] = {
 }
 
 
+class CertifiedCapture(TypedDict):
+    """A capture that a report was made from; ``frames``: the hash of each."""
+
+    role: str
+    hash: str
+    frames: list[str]
+
+
 class Certificate(msgspec.Struct, frozen=True):
-    """What a report was made from. ``captures``: {name: {role, hash, frames: hash of each}}; ``results``: {name: hash};
-    ``page``: digest of the page without this certificate and its date."""
+    """What a report was made from. ``captures`` by name; ``results``: {name: hash}; ``page``: digest of the page
+    without this certificate and its date."""
 
     schema: int
     session: str
     software: dict[str, str]
-    captures: dict[str, dict[str, Any]]
+    captures: dict[str, CertifiedCapture]
     results: dict[str, str]
     figures: Figures
     page: str = ""
@@ -124,7 +132,7 @@ class ReportCheck:
 
 def make_certificate(store: Session) -> Certificate:
     """Return the certificate of a session as it is, without the digest of a page; reads every frame."""
-    captures = {
+    captures: dict[str, CertifiedCapture] = {
         capture.name: {"role": capture.role, "hash": capture.hash, "frames": capture.verify()}
         for capture in store.captures()
     }
@@ -177,11 +185,13 @@ def read_certificate(path: Path) -> tuple[str, Certificate]:
         page = read_file(path, _MAX_REPORT_BYTES).decode()
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path} cannot be read ({error}): give a report that slviewer wrote") from error
-    found = re.search(CERTIFICATE, page, re.DOTALL)
-    if found is None:
+    _, content, _ = split_page(page, CERTIFICATE)
+    if content is None:
         raise InputError(f"{path.name} holds no certificate: write the report again with this version of slviewer")
+    if len(content) > MAX_JSON_BYTES:
+        raise InputError(f"the certificate in {path.name} is longer than any: write the report again")
     try:
-        certificate = msgspec.json.decode(html.unescape(found[1]), type=Certificate)
+        certificate = msgspec.json.decode(html.unescape(content), type=Certificate)
     except (msgspec.DecodeError, RecursionError) as error:
         raise InputError(f"the certificate in {path.name} is damaged ({error}): write the report again") from error
     if certificate.schema > SCHEMA:
@@ -308,12 +318,26 @@ def _calibrate_again(store: Session, fresh: Session, why: dict[str, str]) -> Non
         }
         for name in models:
             saved, arrays = store.load_result(f"calibration/{name}")
-            own = ("hash", "arrays", "checksums")  # which the session writes itself
-            fresh.save_result(f"calibration/{name}", {k: v for k, v in saved.items() if k not in own}, arrays)
-        return
+            fresh.save_result(f"calibration/{name}", _without_own(saved), arrays)
+    else:
+        _repeat_calibration(stereo, meta["settings"], models, fresh, why)
+    for model in available_models(fresh):
+        if (applied := load_scale_correction(store, model)) is not None:
+            inputs = fresh.input_hashes(f"calibration/{model}")
+            fresh.save_result(f"scale/{model}", {**_without_own(applied), "inputs": inputs}, {})
+
+
+def _without_own(meta: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a stored meta without what the session writes itself."""
+    return {key: value for key, value in meta.items() if key not in ("hash", "arrays", "checksums")}
+
+
+def _repeat_calibration(
+    stereo: StereoModel, settings: Mapping[str, Any], models: Sequence[str], fresh: Session, why: dict[str, str]
+) -> None:
+    """Calibrate from the frames of the poses that a stereo model was made from, with its settings."""
     excluded = [name for name, reason in stereo.excluded.items() if reason.startswith(_BY_OPERATOR)]
     poses = [name for name in (*stereo.poses, *stereo.excluded) if name not in excluded and name in fresh.taken_names()]
-    settings = meta["settings"]
     with _note_failure(why, *(f"calibration/{name}" for name in models)):
         calibrate(
             fresh,
@@ -323,10 +347,6 @@ def _calibrate_again(store: Session, fresh: Session, why: dict[str, str]) -> Non
             smoothing=settings["smoothing"],
             degree=settings["degree"],
         )
-    for model in available_models(fresh):
-        if (applied := load_scale_correction(store, model)) is not None:
-            inputs = fresh.input_hashes(f"calibration/{model}")
-            fresh.save_result(f"scale/{model}", {**applied, "inputs": inputs}, {})
 
 
 def _verify_again(store: Session, fresh: Session, result: str) -> dict[str, float]:

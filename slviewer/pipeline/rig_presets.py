@@ -96,8 +96,9 @@ def check_choice(choice: Choice, where: str) -> None:
             or (not value and key != "settle_ms")
         ):
             raise InputError(f"{where}: {key} = {value!r} is no number above 0, up to {largest:g}: correct it")
-    if not isinstance(choice.get("name", ""), str):
-        raise InputError(f"{where}: name = {choice['name']!r} is no text: correct it")
+    name = choice.get("name", "")
+    if not isinstance(name, str) or not name.isprintable():
+        raise InputError(f"{where}: name = {name!r} is no text that can be printed: correct it")
     if "turntable" in choice:
         _check_device(choice, "turntable", where)
     if "driver" in choice:

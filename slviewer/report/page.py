@@ -23,9 +23,10 @@ from slviewer.errors import InputError
 from slviewer.printable import escape_controls
 from slviewer.session.atomic import rename
 
-CERTIFICATE = r'<template id="certificate">(.*?)</template>'
-"""Where a page keeps what it was made from, as escaped JSON; browsers neither show nor run it."""
-_WRITTEN = r"<footer>.*?</footer>"
+CERTIFICATE = '<template id="certificate">', "</template>"
+"""What stands before and after a page's certificate: what it was made from, as escaped JSON; browsers neither show nor
+run it."""
+_WRITTEN = "<footer>", "</footer>"
 Mark = Literal["", "better", "worse", "strong", "muted"]
 """How a value stands to its rivals; colour and weight follow it, and the text beside it says so in words."""
 
@@ -163,7 +164,7 @@ def write_page(
     """
     page = _render(title, subtitle, [Headline(*headline) for headline in headlines], sections, frame)
     if certify is not None:
-        kept = f'<template id="certificate">{html.escape(certify(page_digest(page)))}</template>'
+        kept = html.escape(certify(page_digest(page))).join(CERTIFICATE)
         page = page.replace("</body>", f"{kept}</body>")
     path = Path(path)
     temporary = path.with_name(f".{path.name}.tmp-{os.getpid()}-{secrets.token_hex(4)}")
@@ -181,9 +182,19 @@ def write_page(
             temporary.unlink()
 
 
+def split_page(page: str, marks: tuple[str, str]) -> tuple[str, str | None, str]:
+    """Return what stands before the first pair of marks in a page, between them (None without them), and after."""
+    before, _, rest = page.partition(marks[0])
+    content, end, after = rest.partition(marks[1])
+    return before, content if end else None, after
+
+
 def page_digest(page: str) -> str:
     """Return the digest of a page without its certificate, and without the line that says when it was written."""
-    body = re.sub(_WRITTEN, "", re.sub(CERTIFICATE, "", page, flags=re.DOTALL), flags=re.DOTALL)
+    body = page
+    for marks in (CERTIFICATE, _WRITTEN):
+        before, content, after = split_page(body, marks)
+        body = before + after if content is not None else body
     return hashlib.blake2b(body.encode(), digest_size=20).hexdigest()
 
 

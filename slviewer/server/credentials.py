@@ -8,7 +8,6 @@ import os
 import secrets
 import socket
 import ssl
-import stat
 import sys
 import tomllib
 from collections.abc import Mapping
@@ -20,6 +19,7 @@ from slviewer.errors import SlviewerError, UsageError
 from slviewer.server.access import ROLES, Role
 from slviewer.server.binding import network_address
 from slviewer.session.atomic import rename
+from slviewer.session.reading import open_regular
 
 _MOST_BYTES = 4096
 _VALID_DAYS = 397
@@ -37,13 +37,12 @@ def load_tokens(path: Path) -> dict[Role, str]:
         save_tokens(path, tokens)
         return tokens
     try:
-        with path.open("rb") as file:
-            status = os.fstat(file.fileno())
-            if not stat.S_ISREG(status.st_mode):
-                raise UsageError(f"{path} is no file: give a TOML file with the tokens.")
-            if os.name == "posix" and status.st_mode & 0o077:
+        with open_regular(path) as file:
+            if os.name == "posix" and os.fstat(file.fileno()).st_mode & 0o077:
                 raise UsageError(f"Others can read the tokens in {path}: run chmod 600 {path}.")
             given = tomllib.loads(file.read(_MOST_BYTES).decode())
+    except OSError as error:
+        raise UsageError(f"{path} cannot be read ({error}): give a TOML file with the tokens.") from error
     except (ValueError, RecursionError) as error:
         raise UsageError(f"{path} is no TOML file with tokens, such as operate = '...': {error}.") from error
     if not given or not given.keys() <= set(ROLES) or not all(isinstance(token, str) for token in given.values()):
@@ -74,6 +73,8 @@ class Certificate:
             raise SlviewerError(f"{self.key} is encrypted: give a key without a passphrase.")
 
         try:
+            for path in (self.chain, self.key):
+                open_regular(path).close()  # of a pipe or a device, OpenSSL would wait for the end
             context.load_cert_chain(self.chain, self.key, refuse_passphrase)
         except (OSError, ValueError) as error:
             raise SlviewerError(

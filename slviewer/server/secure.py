@@ -1,6 +1,7 @@
 """A viser server that only invited browsers reach, and that changes only what its page offers them to change."""
 
 import ipaddress
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,6 +11,7 @@ import viser
 from websockets.asyncio.server import ServerConnection
 from websockets.asyncio.server import serve as serve_websockets
 
+from slviewer.errors import UsageError
 from slviewer.server import viser_internals
 from slviewer.server.access import Access, Role
 from slviewer.server.auth_middleware import AuthMiddleware, DevicePage
@@ -24,6 +26,7 @@ from slviewer.server.uploads import UploadBudget
 
 MESSAGE_LIMIT = 32 * 2**20
 """Bytes of one message from a browser; the largest is a picture that the server requested."""
+_NAME = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9_](?:[A-Za-z0-9._-]{0,251}[A-Za-z0-9_])?)(:[0-9]{1,5})?")
 _LEAVING_SECONDS = 3.0
 """How long a browser that requested new links may take to open its own."""
 
@@ -32,9 +35,9 @@ _LEAVING_SECONDS = 3.0
 class Serving:
     """Where and how to serve. `port` 0 takes any free one.
 
-    `names` are further host names (`name` or `name:port`) under which browsers reach the server, behind a proxy, say.
-    `tls`: encrypt, with the files of a certificate (PEM: the chain, the key), else with a self-made one. `token_file`
-    holds tokens that stay the same.
+    `names` are further host names (`name` or `name:port`) under which browsers reach the server, behind a proxy, say;
+    UsageError for what is none. `tls`: encrypt, with the files of a certificate (PEM: the chain, the key), else with a
+    self-made one. `token_file` holds tokens that stay the same.
     """
 
     host: str = "127.0.0.1"
@@ -43,6 +46,14 @@ class Serving:
     tls: bool = False
     tls_files: tuple[Path, Path] | None = None
     token_file: Path | None = None
+
+    def __post_init__(self) -> None:
+        for name in self.names:
+            if not _NAME.fullmatch(name):
+                raise UsageError(
+                    f"{name!r} is no host name as browsers send it: give one of letters, digits, '-' and '.', with "
+                    "its port if that is another one, and other letters as xn--…"
+                )
 
 
 @dataclass(frozen=True)

@@ -258,6 +258,17 @@ def _read_changes(decided: Path) -> list[tuple[Path, Path | None, Path | None]]:
         ]
 
 
+def _check_unlinked(decided: Path) -> None:
+    """Raise DamagedError where a link leads a change that a file of `Together` lists out of the file's folder.
+
+    The file may have come with the session from somebody else, who would so delete any folder of this user.
+    """
+    root = decided.parent.resolve()
+    for path in (path for change in _read_changes(decided) for path in change if path is not None):
+        if not path.parent.resolve().is_relative_to(root):
+            raise DamagedError(f"{decided} is damaged ({path} is outside of {root}): nothing was changed there")
+
+
 def move(folder: Path, target: Path) -> None:
     """Rename a folder within the session and make that durable."""
     with disk_errors(target.parent):
@@ -296,6 +307,7 @@ def recover(root: Path, trash_place: Callable[[Path], Path]) -> list[Path]:
     for path in list_leftovers(root):
         if path.parent == root and path.name.startswith(f".{_TOGETHER}.new-"):
             with suppress(DamagedError):
+                _check_unlinked(path)
                 _finish_together(path)
             discard(path)
     for path in list_leftovers(root):

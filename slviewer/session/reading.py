@@ -17,7 +17,7 @@ from typing import Any, BinaryIO
 
 from slviewer.errors import DamagedError, InputError
 
-MAX_JSON_BYTES = 1 << 26
+MAX_JSON_BYTES = 1 << 24
 MAX_TOML_BYTES = 1 << 20
 MAX_IMAGE_BYTES = 1 << 29
 MAX_CLOUD_BYTES = 1 << 31

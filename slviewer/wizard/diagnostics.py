@@ -11,6 +11,7 @@ import platform
 import sys
 import zipfile
 from collections import deque
+from contextlib import suppress
 from dataclasses import asdict
 from datetime import datetime
 from typing import Any
@@ -18,8 +19,9 @@ from typing import Any
 import cv2
 
 from slviewer import __version__
-from slviewer.errors import hide_passwords
+from slviewer.errors import SessionError, hide_passwords
 from slviewer.session.atomic import to_json
+from slviewer.session.reading import MAX_JSON_BYTES, read_file
 from slviewer.session.store import Session
 from slviewer.wizard.export_files import staged_export
 from slviewer.wizard.jobs import Reporter
@@ -62,14 +64,19 @@ def write_bundle(
         bundle.writestr("state.json", hide_passwords(to_json(_summarise_state(snapshot)).decode()))
         bundle.writestr("log.txt", "\n".join(log.lines) + "\n")
         for file in ("session.json", "decisions.json"):
-            if (session.folder / file).is_file():
-                bundle.writestr(f"session/{file}", hide_passwords((session.folder / file).read_text("utf-8")))
+            with suppress(OSError):  # whatever it holds: a damaged one may be the reason for the report
+                content = read_file(session.folder / file, MAX_JSON_BYTES)
+                bundle.writestr(f"session/{file}", hide_passwords(content.decode(errors="replace")))
         report(0.4, "captures and results")
         for capture in session.captures():
             described = {key: value for key, value in capture.meta.items() if key != "sequence"}
             bundle.writestr(f"session/captures/{capture.name}.json", hide_passwords(to_json(described).decode()))
         for result in session.result_names():
-            bundle.writestr(f"session/results/{result}.json", to_json(session.load_result(result, only=())[0]))
+            try:
+                described = session.load_result(result, only=())[0]
+            except SessionError as error:
+                described = {"damaged": str(error)}
+            bundle.writestr(f"session/results/{result}.json", to_json(described))
         report(0.8, "previews")
         if snapshot.session is not None:
             thumbnails = {pose.name: pose.thumbnail for pose in snapshot.session.poses}

@@ -1,7 +1,6 @@
 """A report names what it was made from, and its figures are computed again from the frames."""
 
 import html
-import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -17,7 +16,7 @@ from slviewer.pipeline.certificate import ReportCheck, certify_page, read_certif
 from slviewer.pipeline.measured_surface import load_surface
 from slviewer.pipeline.measurements import add_distance, add_fit, add_relation, add_section
 from slviewer.pipeline.report import report
-from slviewer.report.page import CERTIFICATE
+from slviewer.report.page import CERTIFICATE, split_page
 from slviewer.session.store import Session
 
 pytestmark = pytest.mark.slow
@@ -33,6 +32,9 @@ def certified(recorded: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple
         store.trash_result("calibration/splined")
     assert main(["calibrate", str(folder), "--target", "circles:21x16:9", "--models", "stereo", "pixelwise"]) == 0
     with Session.open(folder, write=True) as store:
+        inputs = store.input_hashes("calibration/pixelwise")
+        applied = {"factor": 1.001, "U_ppm": 20.0, "certificate": "lab 7", "inputs": inputs}
+        store.save_result("scale/pixelwise", applied, {})
         plane = load_surface(store, "plane_01")
         middle = tuple(int(v) for v in np.argwhere(plane.measured).mean(axis=0)[::-1])
         first = add_fit(store, plane, "plane", Region.ball(plane.points[middle[1], middle[0]], 20.0))
@@ -82,8 +84,8 @@ def test_a_figure_forged_with_its_digest_does_not_follow_from_the_frames(
     figures = {name: dict(values) for name, values in certificate.figures.items()}
     figures["measurements/m2"]["distance, mm"] *= 1.01
     forged = certify_page(msgspec.structs.replace(certificate, figures=figures), certificate.page)
-    kept = f'<template id="certificate">{html.escape(forged)}</template>'
-    (tmp_path / "forged.html").write_text(re.sub(CERTIFICATE, lambda _: kept, text, flags=re.DOTALL))
+    before, _, after = split_page(text, CERTIFICATE)
+    (tmp_path / "forged.html").write_text(before + html.escape(forged).join(CERTIFICATE) + after)
     found = verify_report(folder, tmp_path / "forged.html")
     assert [check.what for check in found.checks if check.state == "differs"] == ["measurements/m2"]
     assert "distance, mm" in found.text() and "DOES NOT HOLD" in found.text()
@@ -108,6 +110,8 @@ def test_pages_without_a_certificate_are_refused(certified: tuple[Path, Path], t
         ("<html></html>", "no certificate"),
         ('<template id="certificate">{"schema": 1</template>', "damaged"),
         ('<template id="certificate">{"schema": "x"}</template>', "damaged"),
+        (certified[1].read_text().replace("&quot;frames&quot;", "&quot;other&quot;", 1), "damaged"),
+        ('<template id="certificate">' * 40_000, "no certificate"),
     ):
         page.write_text(content)
         with pytest.raises(InputError, match=reason):

@@ -86,6 +86,7 @@ def test_a_choice_as_toml_is_the_same_choice():
         ({"exposure_ms": 0}, "exposure_ms = 0 is no number above 0"),
         ({"gain": True}, "gain = True is no number"),
         ({"name": 3}, "name = 3 is no text"),
+        ({"name": "a\u202eb"}, r"name = 'a\\u202eb' is no text"),
         ({"camera": {"driver": "fake", "source": "0", "monochrome": True}}, "no option 'monochrome': use source, mono"),
         ({"camera": {"driver": "fake"}}, "needs source"),
         ({"camera": {"driver": "fale", "source": "0"}}, "no driver is called 'fale': use one of .*fake, .*lacking"),

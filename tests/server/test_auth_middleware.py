@@ -3,6 +3,7 @@
 import contextlib
 import http.server
 import logging
+import os
 import socket
 import threading
 import time
@@ -181,6 +182,21 @@ def test_a_file_of_no_tokens_is_refused(tmp_path, content):
     file.chmod(0o600)
     with pytest.raises(UsageError):
         serve(Serving(port=0, token_file=file))
+
+
+@pytest.mark.parametrize("kind", ["pipe", "device", "folder"])
+def test_secrets_are_read_from_regular_files_alone(tmp_path, kind):
+    file = tmp_path / "tokens.toml"
+    if kind == "pipe":
+        os.mkfifo(file, 0o600)
+    elif kind == "device":
+        file.symlink_to("/dev/zero")
+    else:
+        file.mkdir(0o700)
+    with pytest.raises(UsageError):
+        serve(Serving(port=0, token_file=file))
+    with pytest.raises(SlviewerError, match="as PEM"):
+        serve(Serving(port=0, tls_files=(file, file)))
 
 
 def test_health_is_answered_without_a_link_and_discloses_nothing(server, stranger):

@@ -10,7 +10,7 @@ import time
 import pytest
 from playwright.sync_api import Browser
 
-from slviewer.errors import SlviewerError
+from slviewer.errors import SlviewerError, UsageError
 from slviewer.server import credentials
 from slviewer.server.credentials import Certificate, self_made_certificate
 from slviewer.server.limits import STRANGERS_PER_ADDRESS
@@ -96,6 +96,13 @@ def test_a_self_made_certificate_stays_the_same_until_it_does_not_fit(certificat
     der = ssl.PEM_cert_to_DER_cert(before.decode())
     assert certificate.fingerprint.replace(":", "").lower() == hashlib.sha256(der).hexdigest()
     assert self_made_certificate("192.0.2.7", (), folder).chain.read_bytes() != before
+
+
+@pytest.mark.parametrize("name", ["ä.lab", "a b", "", "a/b", "::1", "x" * 300, "a:b", "*.lab"])
+def test_a_name_that_no_browser_sends_is_refused(name):
+    with pytest.raises(UsageError, match="host name"):
+        Serving(names=(name,))
+    assert Serving(names=("Scanner.lab:8443", "xn--4ca.lab", "[::1]", "scan_1")).names
 
 
 def test_files_that_are_no_certificate_are_refused_at_once(certificate, tmp_path):

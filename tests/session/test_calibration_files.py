@@ -78,6 +78,7 @@ def test_what_cannot_be_written_leaves_the_old_file(tmp_path):
         ({"rot": np.zeros((3, 1))}, r"rot has shape \(3, 1\)"),
         ({"trans": np.zeros((2, 1))}, r"trans has shape \(2, 1\)"),
         ({"trans": np.array([[0.3, 0.0, 0.0]])}, "in mm"),
+        ({"trans": np.array([[1e308, 1e308, 0.0]])}, "in mm"),
         ({"M1": np.eye(4)}, "a camera matrix is 3x3"),
         ({"M1": rig()["M1"].T}, "no camera matrix"),
         ({"M1": rig()["M1"] + np.array([[0, 2, 0], [0, 0, 0], [0, 0, 0]])}, "skew"),
@@ -87,6 +88,7 @@ def test_what_cannot_be_written_leaves_the_old_file(tmp_path):
         ({"M2": "words"}, "M2 is no matrix"),
     ],
 )
+@pytest.mark.filterwarnings("error")  # which NumPy would print beside the message
 def test_what_cannot_be_used_is_named(tmp_path, change, message):
     entries = {key: value for key, value in {**rig(), **change}.items() if value is not None}
     with pytest.raises(InputError, match=message):

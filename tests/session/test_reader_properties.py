@@ -1,6 +1,9 @@
 """Laws of every reader of files: any bytes and any values give a typed value or one of our errors, nothing else."""
 
+import html
 import json
+import shutil
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -8,6 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import trimesh
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -15,10 +19,17 @@ from slviewer.errors import SlviewerError
 from slviewer.fringe.presets import phase_steps
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.pipeline.accept import read_artefact
+from slviewer.pipeline.certificate import read_certificate
 from slviewer.pipeline.rig_presets import load_rig
+from slviewer.pipeline.scan_edits import parse_region
 from slviewer.printable import escape_controls
+from slviewer.report.page import CERTIFICATE
+from slviewer.server.credentials import load_tokens
+from slviewer.session.exporters import write_calibration
+from slviewer.session.importers.filestorage import read_storage
 from slviewer.session.importers.frames import read_description
 from slviewer.session.importers.images import read_image
+from slviewer.session.inspection_plan import read_plan
 from slviewer.session.nominal import read_nominal
 from slviewer.session.ply import read_ply, write_ply
 from slviewer.session.reading import read_toml
@@ -115,6 +126,7 @@ _RECORDS: dict[str, Callable[[Session], object]] = {
     "results/measurements/m1/meta.json": _use_result,
     "session.json": lambda store: Session.open(store.folder).close(),
 }
+_LISTED = {"changes": [["results/measurements/m1", None, "trash/m1"], ["results/a", "results/.a.tmp-1-ab", None]]}
 
 
 @pytest.mark.parametrize("name", _RECORDS)
@@ -129,6 +141,29 @@ def test_a_damaged_record_is_refused_or_typed(full: Session, name: str, data: st
         _read(lambda: _RECORDS[name](full))
     finally:
         path.write_bytes(sound)
+
+
+@given(data=st.data())
+def test_a_damaged_array_is_refused_or_read(full: Session, data: st.DataObject) -> None:
+    path = full.folder / "results/measurements/m1/arrays/K.npy"
+    sound = path.read_bytes()
+    path.write_bytes(data.draw(_damaged_bytes(sound)))
+    _read(lambda: _use_result(full))
+    _read(lambda: full.load_result("measurements/m1", only=["K"]))
+    path.write_bytes(sound)
+
+
+@given(data=st.data())
+def test_a_damaged_list_of_changes_is_finished_or_discarded(tmp_path: Path, data: st.DataObject) -> None:
+    """And nothing beside the session changes."""
+    folder = Path(tempfile.mkdtemp(dir=tmp_path)) / "session"
+    Session.create(folder).close()
+    (folder.parent / "results").mkdir()
+    sound = json.dumps(_LISTED).encode()
+    damage = _damaged(_LISTED).map(lambda values: json.dumps(values).encode()) | _damaged_bytes(sound)
+    (folder / ".together.new-1-ab").write_bytes(data.draw(damage))
+    Session.open(folder, write=True).close()
+    assert not list(folder.glob(".together*")) and len(list(folder.parent.iterdir())) == 2
 
 
 @given(data=_damaged({"shape": [4, 6, 8]}))
@@ -148,10 +183,17 @@ def _asset(name: str) -> dict[str, Any]:
 
 
 _FRAMES = [frame.to_dict() | {"file": f"{i}.png"} for i, frame in enumerate(phase_steps("x", 3, 96.0))]
+_SPHERE = {"name": "ball", "kind": "sphere", "region": {"kind": "ball", "centre": [0.0, 0.0, 500.0], "size": [150.0]}}
+_SIZE = {"name": "d", "kind": "diameter", "features": ["ball"], "nominal": 250.0, "lower": 249.0, "upper": 251.0}
+_PLAN = {"version": 1, "name": "plan", "alignment": {"kind": "none"}, "feature": [_SPHERE], "characteristic": [_SIZE]}
+_BOX = {"centre_mm": [0.0, 0.0, 600.0], "size_mm": [9.0, 9.0, 9.0], "rotation_deg": [0.0, 10.0, 0.0]}
 _TABLES: dict[str, tuple[dict[str, Any], Callable[[Path], object]]] = {
     "frames": ({"projector": "96x64", "phase_sign": 1, "frame": _FRAMES}, read_description),
     "artefact": (_asset("artefacts/sphere_196.toml"), read_artefact),
     "rig": (_asset("rigs/simulated.toml"), load_rig),
+    "plan": (_PLAN, read_plan),
+    "region": (_BOX, lambda path: parse_region(str(path))),
+    "tokens": ({"operate": "o" * 20, "watch": "w" * 20}, load_tokens),
     "any": ({"a": {"b": [1]}}, read_toml),
 }
 
@@ -161,6 +203,7 @@ _TABLES: dict[str, tuple[dict[str, Any], Callable[[Path], object]]] = {
 def test_a_damaged_table_is_refused_or_typed(tmp_path: Path, name: str, data: st.DataObject) -> None:
     sound, read = _TABLES[name]
     path = tmp_path / "table.toml"
+    path.touch(0o600)
     path.write_bytes(_to_toml(sound))
     read(path)
     values = data.draw(_damaged(sound) | _damaged_bytes(_to_toml(sound)))
@@ -201,5 +244,46 @@ def test_a_damaged_file_of_points_or_pixels_is_refused_or_read(tmp_path: Path, k
         sound, read = path.read_bytes(), read_ply if kind == "ply" else read_nominal
     path.write_bytes(sound)
     read(path)
+    path.write_bytes(data.draw(_damaged_bytes(sound)))
+    _read(lambda: read(path))
+
+
+_CERTIFIED = {
+    **{"schema": 1, "session": "s", "software": {}, "results": {}, "figures": {"verify/a": {"rms_mm": 1.0}}},
+    "captures": {"a": {"role": "scan", "hash": "0", "frames": ["0"]}},
+}
+
+
+@given(data=st.data())
+def test_a_damaged_certificate_is_refused_or_typed(tmp_path: Path, data: st.DataObject) -> None:
+    def page(values: Any) -> bytes:
+        """Return a page with these values as its certificate."""
+        return html.escape(json.dumps(values)).join(CERTIFICATE).encode()
+
+    path = tmp_path / "report.html"
+    path.write_bytes(page(_CERTIFIED))
+    read_certificate(path)
+    path.write_bytes(data.draw(_damaged(_CERTIFIED).map(page) | _damaged_bytes(page(_CERTIFIED))))
+    _read(lambda: read_certificate(path))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["yml", "json", "step", "3mf"])
+@settings(max_examples=5)
+@given(data=st.data())
+def test_a_damaged_file_that_another_process_parses_is_refused_or_read(
+    tmp_path: Path, kind: str, data: st.DataObject
+) -> None:
+    path = tmp_path / f"file.{kind}"
+    if kind in ("yml", "json"):
+        write_calibration(path, {"K": np.eye(3)})
+        read: Callable[[Path], Any] = read_storage
+    else:
+        read = read_nominal
+        if kind == "step":
+            shutil.copy(Path(__file__).parent / "plate.step", path)
+        else:
+            trimesh.creation.box((10, 20, 30)).export(path)
+    sound = path.read_bytes()
     path.write_bytes(data.draw(_damaged_bytes(sound)))
     _read(lambda: read(path))

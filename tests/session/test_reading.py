@@ -54,6 +54,14 @@ def test_values_that_no_record_has_are_refused(tmp_path, text):
         read_toml(path)
 
 
+@pytest.mark.parametrize("element", ["[]", "{}", "[" * 29 + "]" * 29])
+def test_containers_without_end_are_refused_before_they_take_memory(tmp_path, element):
+    path = tmp_path / "file.json"
+    path.write_text('{"a": [' + f"{element}," * (25_000_000 // len(element)) + "0]}")
+    with pytest.raises(DamagedError, match="MB"):
+        read_json(path)
+
+
 def test_a_user_that_does_not_exist_is_named():
     with pytest.raises(InputError, match="nobody-of-that-name"):
         expand_user("~nobody-of-that-name/x")

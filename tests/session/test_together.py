@@ -1,6 +1,7 @@
 """Results that belong together are replaced together, whatever happens on the way."""
 
 import errno
+import json
 import os
 from collections.abc import Callable, Iterator
 
@@ -122,3 +123,15 @@ def test_a_listing_that_names_other_folders_is_ignored(folder, listed):
     (folder / ".together.new-1-ab").write_text(listed)
     assert age(folder) == "old"
     assert (folder.parent / "x").is_dir() and not list(folder.glob(".together*"))
+
+
+@pytest.mark.parametrize("change", [["captures/x", "captures/y", None], ["captures/x", None, "trash/x"]])
+def test_a_listing_that_leads_outside_by_a_link_is_ignored(folder, change):
+    """A session from somebody else may come with both."""
+    for name in ("x", "y"):
+        (folder.parent / "home" / name / "inside").mkdir(parents=True)
+    (folder / "captures").rmdir()
+    (folder / "captures").symlink_to(folder.parent / "home")
+    (folder / ".together.new-1-ab").write_text(json.dumps({"changes": [change]}))
+    assert age(folder) == "old"
+    assert sorted(path.name for path in (folder.parent / "home").rglob("*")) == ["inside", "inside", "x", "y"]

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -142,6 +143,21 @@ def test_a_session_opens_whose_decisions_are_damaged(folder: Path) -> None:
         assert any("decisions.json" in fault and "move this file away" in fault for fault in shown.faults)
         assert not operator.choose_target("circles:7x5:20")  # which would forget the others
     assert (folder / "decisions.json").read_text() == "{"
+
+
+def test_diagnostics_are_written_of_a_damaged_session(folder: Path) -> None:
+    with Session.open(folder, write=True) as session:
+        session.save_result("clouds/scan_01", {}, {})
+    with Operator(folder) as operator:
+        operator.wait_until_idle(30)
+        (folder / "decisions.json").write_bytes(b"{\xff")
+        (folder / "results/clouds/scan_01/meta.json").write_text("{")
+        assert operator.diagnostic_bundle()
+        operator.wait_until_idle(30)
+        (bundle,) = (folder / "exports").glob("diagnostics_*.zip")
+        with zipfile.ZipFile(bundle) as inside:
+            assert inside.read("session/decisions.json").startswith(b"{")
+            assert b"meta.json" in inside.read("session/results/clouds/scan_01.json")
 
 
 def test_captures_that_were_completed_on_opening_are_reported(folder: Path) -> None:

@@ -1,10 +1,12 @@
 """A stereo calibration made elsewhere, in an OpenCV FileStorage file (YAML, XML or JSON)."""
 
+import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from slviewer.errors import InputError
+from slviewer.geometry.rig import LARGEST_BASELINE_MM
 from slviewer.session.importers.filestorage import Storage
 
 ENTRIES = ("K_camera", "D_camera", "K_projector", "D_projector", "R", "T")
@@ -132,12 +134,13 @@ def _check_rotation(matrix: np.ndarray, where: str) -> np.ndarray:
 
 
 def _check_translation(matrix: np.ndarray, where: str) -> np.ndarray:
-    """Return the translation (3,) mm; InputError for another shape or a length near zero."""
+    """Return the translation (3,) mm; InputError for another shape or an impossible length."""
     if matrix.shape not in ((3, 1), (1, 3), (3,)):
         raise InputError(f"{where} has shape {matrix.shape}: the translation from camera to projector has 3 numbers")
-    translation = matrix.ravel()
-    if np.linalg.norm(translation) < _SHORTEST_BASELINE_MM:
-        raise InputError(f"{where} is {np.linalg.norm(translation):.3g} long: give the translation in mm")
+    translation: np.ndarray = matrix.ravel()
+    length = math.hypot(*translation)
+    if not _SHORTEST_BASELINE_MM <= length <= LARGEST_BASELINE_MM:
+        raise InputError(f"{where} is {length:.3g} long: give the translation in mm")
     return translation
 
 
