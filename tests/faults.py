@@ -11,9 +11,12 @@ import argparse
 import builtins
 import contextlib
 import errno
+import importlib
 import io
 import os
+import pkgutil
 import random
+import re
 import shutil
 import signal
 import sys
@@ -26,6 +29,7 @@ from typing import Any
 
 import pytest
 
+import slviewer
 from slviewer import cli
 from slviewer.pipeline.inspect import inspect
 from slviewer.session.store import Session
@@ -224,6 +228,14 @@ def make_seed(folder: Path, poses: int = 7) -> None:
         store.include(f"pose_{poses:02d}")
 
 
+def import_modules() -> None:
+    """Import what commands import, so that not every forked child has to."""
+    names = [module.name for module in pkgutil.walk_packages(slviewer.__path__, "slviewer.")]
+    for name in (*names, "numba", "scipy.optimize", "scipy.spatial", "zarr"):
+        if not re.search(r"\.(gui|validation)|cuda", name):
+            importlib.import_module(name)
+
+
 def make_in_child(make: Callable[[], None]) -> None:
     """Run a function in a forked child: threads of compiled code must not run where later children are forked."""
     child = os.fork()
@@ -322,6 +334,7 @@ def run(kills: int, faults: int, seed: int, commands: tuple[str, ...]) -> Counte
         sound, folder = Path(root, "seed"), Path(root, "case")
         sound.mkdir()
         make_in_child(lambda: make_seed(sound))
+        import_modules()
         before, counts = describe(sound / "S"), {}
         for command in commands:  # compiles, and counts the places to fail at
             shutil.copytree(sound, folder)

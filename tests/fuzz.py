@@ -452,6 +452,7 @@ def main() -> int:
         seed, folder = Path(root, "seed"), Path(root, "case")
         seed.mkdir()
         faults.make_in_child(lambda: make_seed(seed))
+        faults.import_modules()
         lasts = _warm_up(seed, folder)
         end = time.monotonic() + 60 * options.minutes
         for number in range(count):

@@ -21,7 +21,8 @@ INSTALL_COMMAND = "pip install 'slviewer[cad]'"
 CHORD_MM = 0.005
 """Largest distance of the triangles from the surfaces of a STEP model."""
 _CHORD_RAD = 0.2
-_CPU_S = 60
+_CPU_S, _CPU_S_PER_MB, _MAX_CPU_S = 10, 5, 60
+"""Processor time that a model may take to parse, and more of it for larger files: a small one is not to explode."""
 
 
 def require_packages(file_format: str) -> None:
@@ -37,12 +38,13 @@ def load_triangles(name: str, file_format: str, data: bytes) -> tuple[np.ndarray
     Raises SessionError for a damaged file, and for one that takes too much memory or time.
     """
     require_packages(file_format)
-    status, output = run_isolated(__name__, file_format, data=data, cpu_s=_CPU_S)
+    cpu_s = min(_CPU_S + len(data) * _CPU_S_PER_MB // 1_000_000, _MAX_CPU_S)
+    status, output = run_isolated(__name__, file_format, data=data, cpu_s=cpu_s)
     if status == 1:
         raise SessionError(f"{name} holds no surfaces that can be read, or is damaged: export the model again")
     if status != 0:
         raise SessionError(
-            f"{name} is damaged, or needs more than 2 GB or {_CPU_S} s to read: export the model again, or as STL"
+            f"{name} is damaged, or needs more than 2 GB or {cpu_s} s to read: export the model again, or as STL"
         )
     with np.load(io.BytesIO(output)) as arrays:
         return arrays["vertices"], arrays["faces"]

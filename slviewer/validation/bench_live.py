@@ -41,7 +41,7 @@ _VIEWPOINT = {
     "look_at": [0.0, 0.0, 500.0],
     "up_direction": [0.0, -1.0, 0.0],
 }
-_PATIENCE_S = 120.0  # kernels may have to be compiled first
+_PATIENCE_S = 600.0  # kernels may have to be compiled first
 _WARM_S = 1.0
 _STALLED_AFTER_S = 60.0
 MAX_GROWTH_MB = 20.0
