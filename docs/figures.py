@@ -11,7 +11,7 @@ Single numbers in a sentence or a table follow a comment ``<!-- = NAME -->`` and
 `compute_values` tells how they follow from the JSON of ``slviewer reproduce --quick``. These, and ``slow figures:``,
 need commands of minutes, which run with ``--slow``. ``--check`` changes nothing, and ends with status 1 where a number
 is off by more than 2 % and more than its last digit. ``--pictures`` runs the examples and writes their pictures into
-docs/images/gallery.
+docs/images/gallery, and those of docs/diagrams.py into docs/images/diagrams.
 """
 
 import argparse
@@ -149,6 +149,7 @@ def draw_pictures() -> None:
         if "sys.argv[1:]" not in script.read_text(encoding="utf-8"):  # its only argument is a picture's path
             picture = GALLERY / f"{script.stem}.png"
             subprocess.run([sys.executable, str(script), str(picture)], env=environment, check=True)
+    subprocess.run([sys.executable, str(ROOT / "docs" / "diagrams.py")], env=environment, check=True)
     for notebook in sorted(EXAMPLES.glob("*.ipynb")):
         subprocess.run([sys.executable, __file__, "--notebook", str(notebook)], env=environment, check=True)
     for picture in GALLERY.glob("*.png"):
