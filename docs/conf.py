@@ -126,6 +126,7 @@ def list_gallery() -> dict[str, str]:
         more = more.strip()
         pages[script.stem] = (
             f"# {title.strip('.')}\n\n{more[:1].upper()}{more[1:]}\n\n{picture}```python\n{code.strip()}\n```\n"
+            f"\n{{download}}`{script.name} <../examples/{script.name}>`\n"
         )
     for notebook in sorted((DOCS / "examples").glob("*.ipynb")):
         cells = json.loads(notebook.read_text(encoding="utf-8"))["cells"]
@@ -134,6 +135,7 @@ def list_gallery() -> dict[str, str]:
             source = "".join(cell["source"])
             parts.append(source if cell["cell_type"] == "markdown" else f"```python\n{source}\n```")
             parts.append(_show_picture(f"{notebook.stem}_{k}.png"))
+        parts.append(f"{{download}}`{notebook.name} <../examples/{notebook.name}>`")
         pages[notebook.stem] = "\n\n".join(part for part in parts if part) + "\n"
     return pages
 
@@ -147,7 +149,7 @@ def _describe_card(name: str, page: str) -> str:
     """Return the HTML of a gallery page's entry: its last picture, where it has one, above its title."""
     pictures = re.findall(r"!\[\S+\]\(\.\./images/gallery/(\S+)\)", page)
     shown = f'<img src="../_images/{pictures[-1]}" alt="">' if pictures else ""
-    return f'<a class="card" href="{name}.html">{shown}<span>{html.escape(page[2:].splitlines()[0])}</span></a>'
+    return f'<a class="entry" href="{name}.html">{shown}<span>{html.escape(page[2:].splitlines()[0])}</span></a>'
 
 
 def list_gallery_index(pages: dict[str, str]) -> str:
