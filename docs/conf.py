@@ -7,23 +7,28 @@ are checked by a test.
 
 import ast
 import contextlib
+import html
 import inspect
 import io
 import json
 import os
 import re
 import sys
+import textwrap
 from pathlib import Path
+from typing import Any
 
+from docutils import nodes
 from sphinx.application import Sphinx
 
 DOCS = Path(__file__).parent
 sys.path.insert(0, str(DOCS.parent))
-os.environ["COLUMNS"] = "110"  # tyro formats the help for this width
+os.environ["COLUMNS"] = "88"  # tyro formats the help for this width
 os.environ["NO_COLOR"] = "1"
 
 import slviewer  # noqa: E402
 from slviewer import cli  # noqa: E402
+from slviewer.server.help_pages import draw_equation  # noqa: E402
 
 project = "slviewer"
 copyright = "the authors of slviewer"
@@ -34,10 +39,24 @@ suppress_warnings = ["myst.xref_missing"]  # links to files of the repository th
 autodoc_typehints = "description"
 autodoc_member_order = "bysource"
 myst_heading_anchors = 3
+myst_fence_as_directive = ["math"]  # as GitHub and the program's own help read it
+html_math_renderer = "svg"
+default_role = "code"  # names in docstrings stand in single backticks
 html_theme = "pydata_sphinx_theme"
 html_title = "slviewer"
 html_show_sourcelink = False
-html_theme_options = {"navbar_align": "left", "show_prev_next": True, "secondary_sidebar_items": ["page-toc"]}
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
+html_sidebars = {page: [] for page in ("index", "quickstart", "architecture")}  # these have no pages beside them
+html_context = {"default_mode": "auto"}
+html_theme_options = {
+    "navbar_align": "left",
+    "header_links_before_dropdown": 8,
+    "show_prev_next": True,
+    "secondary_sidebar_items": ["page-toc"],
+    "footer_start": ["copyright"],
+    "footer_end": [],
+}
 
 
 def read_help(*arguments: str) -> str:
@@ -50,7 +69,8 @@ def read_help(*arguments: str) -> str:
             cli.main()
     finally:
         sys.argv = saved
-    return re.sub(r"\x1b\[[0-9;]*m", "", printed.getvalue()).rstrip()
+    lines = re.sub(r"\x1b\[[0-9;]*m", "", printed.getvalue()).rstrip().splitlines()
+    return "\n".join(textwrap.fill(line, 88, break_on_hyphens=False) if line[:1].strip() else line for line in lines)
 
 
 def list_options() -> str:
@@ -106,6 +126,7 @@ def list_gallery() -> dict[str, str]:
         more = more.strip()
         pages[script.stem] = (
             f"# {title.strip('.')}\n\n{more[:1].upper()}{more[1:]}\n\n{picture}```python\n{code.strip()}\n```\n"
+            f"\n{{download}}`{script.name} <../examples/{script.name}>`\n"
         )
     for notebook in sorted((DOCS / "examples").glob("*.ipynb")):
         cells = json.loads(notebook.read_text(encoding="utf-8"))["cells"]
@@ -114,6 +135,7 @@ def list_gallery() -> dict[str, str]:
             source = "".join(cell["source"])
             parts.append(source if cell["cell_type"] == "markdown" else f"```python\n{source}\n```")
             parts.append(_show_picture(f"{notebook.stem}_{k}.png"))
+        parts.append(f"{{download}}`{notebook.name} <../examples/{notebook.name}>`")
         pages[notebook.stem] = "\n\n".join(part for part in parts if part) + "\n"
     return pages
 
@@ -123,16 +145,27 @@ def _show_picture(name: str) -> str:
     return f"![{name}](../images/gallery/{name})\n\n" if (DOCS / "images" / "gallery" / name).exists() else ""
 
 
+def _describe_card(name: str, page: str) -> str:
+    """Return the HTML of a gallery page's entry: its last picture, where it has one, above its title."""
+    pictures = re.findall(r"!\[\S+\]\(\.\./images/gallery/(\S+)\)", page)
+    shown = f'<img src="../_images/{pictures[-1]}" alt="">' if pictures else ""
+    return f'<a class="entry" href="{name}.html">{shown}<span>{html.escape(page[2:].splitlines()[0])}</span></a>'
+
+
 def list_gallery_index(pages: dict[str, str]) -> str:
     """Return the gallery's first page, which lists the others."""
     lines = [
         "# Gallery",
         "",
-        "Scripts and notebooks of `docs/examples`, run by the tests; their pictures are written by",
-        "`python docs/figures.py --pictures`. A script takes the path of its picture.",
+        "Scripts and notebooks of `docs/examples`. The tests run them, and `python docs/figures.py --pictures` draws",
+        "their pictures. A script takes the path of its picture.",
+        "",
+        '<div class="gallery">',
+        *(_describe_card(name, text) for name, text in pages.items()),
+        "</div>",
         "",
         "```{toctree}",
-        ":maxdepth: 1",
+        ":hidden:",
         "",
         *pages,
         "```",
@@ -140,6 +173,13 @@ def list_gallery_index(pages: dict[str, str]) -> str:
     return "\n".join(lines) + "\n"
 
 
+def write_equation(writer: Any, node: nodes.math_block) -> None:
+    """Write an equation as SVG: MathJax, the usual way, is loaded from a network."""
+    writer.body.append(draw_equation(node.astext()))
+    raise nodes.SkipNode
+
+
 def setup(app: Sphinx) -> None:
     """Write the pages that are made from the program before all are read."""
     app.connect("builder-inited", write_references)
+    app.add_html_math_renderer("svg", (write_equation, None), (write_equation, None))

@@ -7,11 +7,11 @@ A page names a command in a comment, and its output follows up to the end mark:
     <!-- figures: slviewer plan-rig webcam-1080p pocket-720p 500 -->
     <!-- end of figures -->
 
-Single numbers in a sentence or a table follow a comment ``<!-- = NAME -->`` and end with ``<!-- . -->``;
-`compute_values` tells how they follow from the JSON of ``slviewer reproduce --quick``. These, and ``slow figures:``,
+Single numbers in a sentence or a table follow a comment ``<!-- = NAME -->``, never at the start of a line, and end with
+``<!-- . -->``; `SOURCES` names the commands, and how the numbers follow from their JSON. These, and ``slow figures:``,
 need commands of minutes, which run with ``--slow``. ``--check`` changes nothing, and ends with status 1 where a number
 is off by more than 2 % and more than its last digit. ``--pictures`` runs the examples and writes their pictures into
-docs/images/gallery.
+docs/images/gallery, and those of docs/diagrams.py into docs/images/diagrams.
 """
 
 import argparse
@@ -22,7 +22,7 @@ import shlex
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -36,11 +36,10 @@ BLOCK = re.compile(
 NUMBER = re.compile(r"\d+(?:\.\d+)?")
 TOLERANCE = 0.02
 VALUE = re.compile(r"<!-- = (?P<name>[^\n>]+) -->(?P<number>[\d.]+)<!-- \. -->")
-REPRODUCE = "slviewer reproduce --quick"
 
 
 def compute_values(data: dict[str, Any]) -> dict[str, float]:
-    """Return the numbers of the pages by name, from the JSON of `REPRODUCE`."""
+    """Return the numbers of the pages by name, from the JSON of ``reproduce``."""
     inside = {name: each for name, each in data["planes"].items() if each["incidence"]["R2"] >= 87.0}
     values = {"inside ratio": data["in_range_ratio"]}
     for group, captures in (("planes", data["planes"]), ("inside", inside), ("spheres", data["spheres"])):
@@ -59,12 +58,85 @@ def _mean(numbers: Iterable[float]) -> float:
     return sum(listed) / len(listed)
 
 
+def compute_accuracy(data: dict[str, Any]) -> dict[str, float]:
+    """Return the numbers of the pages by name, from the JSON of ``prove --only accuracy``."""
+    record = data["accuracy"]
+    means = {
+        model: [_mean(plane["rms_mm"][model] for plane in rig["planes"].values()) for rig in record["rigs"]]
+        for model in ("stereo", "splined", "floor")
+    }
+    largest = _find_largest(record["checks"])
+    return {
+        "accuracy stereo least": min(means["stereo"]),
+        "accuracy stereo most": max(means["stereo"]),
+        "accuracy splined": max(means["splined"]),
+        "accuracy floor": max(means["floor"]),
+        **{f"accuracy {region}": largest[f"splined over the floor in {region}"] for region in ("R1", "R2", "R3")},
+        "accuracy radius": largest["largest error of a sphere's radius in mm"],
+        "accuracy spacing": largest["largest error of a spacing in mm"],
+    }
+
+
+def compute_registration(data: dict[str, Any]) -> dict[str, float]:
+    """Return the numbers of the pages by name, from the JSON of ``prove --only registration``."""
+    record = data["registration"]
+    largest, surface = _find_largest(record["checks"]), record["surface"]
+    return {
+        "registration shift": largest["error of its place in mm"],
+        "registration turn": largest["error of its turn in degrees"],
+        "registration loop": largest["loop error in mm round all scans"],
+        "registration predicted shift": largest["predicted over true error of the shift"],
+        "registration predicted turn": largest["predicted over true error of the turn"],
+        "registration single least": min(surface["single_mm"].values()),
+        "registration single most": max(surface["single_mm"].values()),
+        "registration fused": surface["fused_mm"],
+        "registration mesh": surface["turned_mm"],
+    }
+
+
+def compute_edges(data: dict[str, Any]) -> dict[str, float]:
+    """Return the numbers of the pages by name, from the JSON of ``prove --only edges``."""
+    rows = {row["scene"]: row for row in data["edges"]["rows"]}
+    return {
+        f"edges {column} {scene.rpartition(' blur ')[2]}": row[title]
+        for scene, row in rows.items()
+        if scene.startswith("printed plane")
+        for column, title in (("without", "without, µm"), ("with", "with, µm"), ("ratio", "ratio"))
+    }
+
+
+def _find_largest(checks: Iterable[dict[str, Any]]) -> dict[str, float]:
+    """Return {figure: its largest value} of all rigs."""
+    largest: dict[str, float] = {}
+    for check in checks:
+        if check["value"] is not None:
+            largest[check["what"]] = max(check["value"], largest.get(check["what"], check["value"]))
+    return largest
+
+
+SOURCES: dict[str, tuple[str, Callable[[dict[str, Any]], dict[str, float]]]] = {
+    "accuracy": ("slviewer prove --quick --only accuracy", compute_accuracy),
+    "registration": ("slviewer prove --quick --only registration", compute_registration),
+    "edges": ("slviewer prove --only edges", compute_edges),
+    "": ("slviewer reproduce --quick", compute_values),
+}
+"""{first word of a number's name: the command, some minutes, and the numbers that follow from it}."""
+
+
+def find_value(name: str) -> float:
+    """Return a number of the pages by name. Raises KeyError."""
+    group = name.partition(" ")[0]
+    return compute_group(group if group in SOURCES else "")[name]
+
+
 @cache
-def reproduce() -> dict[str, float]:
-    """Run `REPRODUCE`, some minutes, and return the numbers of the pages by name."""
+def compute_group(group: str) -> dict[str, float]:
+    """Run the command of a group of `SOURCES`, and return its numbers by name."""
+    command, compute = SOURCES[group]
     with tempfile.TemporaryDirectory() as folder:
-        run(f"{REPRODUCE} --out {folder}/reproduction --json {folder}/result.json")
-        return compute_values(json.loads(Path(folder, "result.json").read_text(encoding="utf-8")))
+        out = f" --out {folder}/reproduction" if "reproduce" in command else ""
+        run(f"{command}{out} --json {folder}/result.json")
+        return compute(json.loads(Path(folder, "result.json").read_text(encoding="utf-8")))
 
 
 def find_pages() -> list[Path]:
@@ -126,7 +198,7 @@ def update(page: Path, check: bool, slow: bool) -> bool:
         """Return the number with its marks."""
         nonlocal right
         digits = len(match["number"].partition(".")[2])
-        number = f"{reproduce()[match['name']]:.{digits}f}"
+        number = f"{find_value(match['name']):.{digits}f}"
         if agree(match["number"], number):
             return match[0]
         right = False
@@ -149,6 +221,7 @@ def draw_pictures() -> None:
         if "sys.argv[1:]" not in script.read_text(encoding="utf-8"):  # its only argument is a picture's path
             picture = GALLERY / f"{script.stem}.png"
             subprocess.run([sys.executable, str(script), str(picture)], env=environment, check=True)
+    subprocess.run([sys.executable, str(ROOT / "docs" / "diagrams.py")], env=environment, check=True)
     for notebook in sorted(EXAMPLES.glob("*.ipynb")):
         subprocess.run([sys.executable, __file__, "--notebook", str(notebook)], env=environment, check=True)
     for picture in GALLERY.glob("*.png"):

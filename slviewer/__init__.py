@@ -1,9 +1,8 @@
 """slviewer: a camera and a projector as a metrology-grade 3D scanner.
 
-    import slviewer as sl
-
-gives what a notebook needs, imported when it is first used. On a session, a folder that holds captures and results,
-work `import_captures`, `calibrate`, `reconstruct`, `verify`, `merge`, `mesh` and `measure`, named after their commands.
+``import slviewer as sl`` gives what a notebook needs, imported when it is first used. On a session, a folder that holds
+captures and results, work `import_captures`, `calibrate`, `reconstruct`, `verify`, `merge`, `mesh` and `measure`, named
+after their commands.
 On arrays, without a session, work `read_captures`, `decode`, `detect_board`, `calibrate_frames`, `reconstruct_cloud`,
 `evaluate_plane`, `evaluate_sphere`, `align_clouds`, `fuse_clouds`, `mesh_cloud`, `draw_error_maps` and `write_ply`.
 
@@ -24,7 +23,7 @@ invalid            NaN in float maps and clouds, False in masks (True = valid)
 depth ranges       R1 in front of the calibrated depths, R2 inside, R3 behind
 =================  ==========================================================================================
 
-"The Letter" is Vargas, Romero, Zhang and Marrugo, *Pixel-wise rational model for structured light system*,
+"The Letter" is Vargas, Romero, Zhang and Marrugo, *Pixel-wise rational model for a structured light system*,
 Optics Letters 2023; symbols follow it, and docstrings cite its equation or step.
 
 Data flows one way: geometry, fringe, target, calibration, reconstruction, registration, surface, evaluation,

@@ -1,4 +1,4 @@
-"""Merge scans of an object at three depths, and mesh the result; the scans come from the simulated rig."""
+"""Merge three scans and mesh the result: an object at three depths before the simulated rig."""
 
 import sys
 import tempfile

@@ -114,10 +114,15 @@ def read_command(
 
         return work
 
-    parse.__doc__ = description + doc[doc.index("\n\n") :] if description else doc
+    parse.__doc__ = join_lines(description + doc[doc.index("\n\n") :] if description else doc)
     parse.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     parse.__annotations__ = {each.name: each.annotation for each in parameters}
     return parse
+
+
+def join_lines(doc: str) -> str:
+    """Return a docstring with each argument on one line: tyro would break the help where the source is broken."""
+    return re.sub(r"\n {8,}(?=\S)", " ", doc)
 
 
 def show_result(

@@ -21,8 +21,7 @@ def wizard(
 
     Args:
         session: Session folder, made if it does not exist; by default slviewer-session, here.
-        rig: simulated (half resolution), simulated:0.25 and the like, or a driver's name; by default the one that the
-            session remembers, else the simulated one.
+        rig: simulated (half resolution), simulated:0.25 or a driver; by default that of the session, else simulated.
         host: Address to serve at; any other than the default lets others on the network try.
         port: Port to serve at; 0 takes any free one.
         name: Further host names under which browsers reach this server, such as scanner.lab, behind a proxy.

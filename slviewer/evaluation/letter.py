@@ -1,6 +1,6 @@
 """The Letter's own figures, to be shown beside ours.
 
-Vargas, Romero, Zhang and Marrugo, *Pixel-wise rational model for structured light system*, Optics Letters 2023.
+Vargas, Romero, Zhang and Marrugo, *Pixel-wise rational model for a structured light system*, Optics Letters 2023.
 Its R2 is 500 to 700 mm; its target has 16x21 circles, taken in 25 poses.
 """
 

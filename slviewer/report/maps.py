@@ -26,7 +26,7 @@ from slviewer.report.canvas import (
 from slviewer.report.page import Figure
 
 TITLE_PX = 34
-WIDE_PX = 240  # maps that have room for longer titles
+WIDE_PX = 250  # maps that have room for longer titles
 BINS = 121
 
 

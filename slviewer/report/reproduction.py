@@ -26,7 +26,7 @@ BASE, OURS = "stereo", "pixelwise"
 INSIDE_PERCENT = 87.0
 """A plane with this share in R2 counts as inside the calibrated depths, as do the Letter's poses 3, 4, 9 and 10."""
 LETTER = (
-    "The Letter: Vargas, Romero, Zhang and Marrugo, Pixel-wise rational model for structured light system, "
+    "The Letter: Vargas, Romero, Zhang and Marrugo, Pixel-wise rational model for a structured light system, "
     "Optics Letters 2023"
 )
 

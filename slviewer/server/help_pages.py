@@ -9,6 +9,7 @@ import re
 from collections import Counter
 from dataclasses import dataclass
 from functools import cache
+from html import escape
 from importlib import resources
 from itertools import pairwise
 from pathlib import Path
@@ -92,6 +93,9 @@ class HelpPages:
         for token, heading in zip(openings, headings, strict=True):
             token.attrSet("id", heading.anchor)
         self._correct_links(tokens, name)
+        for token in tokens:
+            if token.type == "fence" and token.info.strip() == "math":
+                token.type, token.content = "html_block", draw_equation(token.content)
         root = "../" * name.count("/")
         groups = [
             (title, [(root + page, self._title(page), page == name) for page in self.names if _top_folder(page) == key])
@@ -133,6 +137,30 @@ class HelpPages:
 def docs_folder() -> Path | None:
     """Return the folder of the documentation: in the package or, in a checkout, beside it; None if absent."""
     return next((path for path in (_PACKAGE / "docs", _PACKAGE.parent / "docs") if path.is_dir()), None)
+
+
+def draw_equation(latex: str) -> str:
+    """Return an equation as HTML: an SVG in the colour of the text, which needs neither a script nor a network.
+
+    ``latex``: what matplotlib's mathtext reads of LaTeX. Raises ValueError for anything else.
+    """
+    from matplotlib.font_manager import FontProperties
+    from matplotlib.textpath import TextPath
+
+    source = " ".join(latex.split())
+    path = TextPath((0, 0), f"${source}$", size=10, prop=FontProperties(math_fontfamily="stix"))
+    box = path.get_extents().padded(1.0)
+    letters = {1: "M", 2: "L", 3: "Q", 4: "C", 79: "Z"}
+    drawn = "".join(
+        letters[int(code)]
+        + ("" if code == path.CLOSEPOLY else " ".join(f"{(-x if k % 2 else x):.2f}" for k, x in enumerate(points)))
+        for points, code in path.iter_segments(simplify=False)
+    )
+    return (
+        f'<p class="equation"><svg role="img" aria-label="{escape(source)}" width="{box.width / 10:.2f}em" '
+        f'height="{box.height / 10:.2f}em" viewBox="{box.x0:.1f} {-box.y1:.1f} {box.width:.1f} {box.height:.1f}" '
+        f'fill="currentColor"><path d="{drawn}"/></svg></p>\n'
+    )
 
 
 def _top_folder(name: str) -> str:

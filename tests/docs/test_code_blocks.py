@@ -65,7 +65,7 @@ def name_of(page: Path) -> str:
 
 @pytest.mark.parametrize("page", [page for page in PAGES if page.name not in GENERATED], ids=name_of)
 def test_every_block_states_its_language(page: Path) -> None:
-    known = {"bash", "python", "toml", "text", "nginx"}
+    known = {"bash", "python", "toml", "text", "nginx", "math"}
     unknown = [block.code for block in blocks(page) if not (block.language in known or page.name == "index.md")]
     assert not unknown
 

@@ -43,3 +43,9 @@ def test_the_commands_of_a_page_exist_with_their_options(page: Path) -> None:
         known = help_of(words[0], *layout)
         for option in (word.partition("=")[0] for word in words if word.startswith("--")):
             assert re.search(rf"(?<![\w-]){re.escape(option)}(?![\w-])", known), f"{line}: no {option}"
+
+
+def test_the_page_of_commands_names_every_command() -> None:
+    page = (ROOT / "docs" / "reference" / "commands.md").read_text("utf-8")
+    named = {word for row in re.findall(r"^\| (.+?) \|", page, re.MULTILINE) for word in re.findall(r"`([\w-]+)", row)}
+    assert not set(COMMANDS) - named

@@ -1,5 +1,6 @@
 """Figures in README and docs are what their commands print."""
 
+import importlib.util
 import subprocess
 import sys
 from pathlib import Path
@@ -31,3 +32,14 @@ def test_a_wrong_figure_is_found_and_corrected(tmp_path):
     assert run("--check") == 0
     page.write_text(page.read_text().replace("43 %", "63 %"))
     assert run("--check") == 1
+
+
+def test_every_single_number_has_a_source_and_stands_inside_its_line():
+    spec = importlib.util.spec_from_file_location("figures", ROOT / "docs" / "figures.py")
+    assert spec is not None and spec.loader is not None
+    figures = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(figures)
+    for page in figures.find_pages():
+        text = page.read_text(encoding="utf-8")
+        assert text.count("<!-- = ") == len(figures.VALUE.findall(text)) == text.count("<!-- . -->"), page
+        assert "\n<!-- = " not in text, f"{page}: a comment at the start of a line ends the paragraph"

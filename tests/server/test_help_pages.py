@@ -20,6 +20,7 @@ def folder(tmp_path):
         "explanation/two.md": "# Two\n\n## Set up\n\n## Set up\n\n### `frames` & light\n\n"
         "| a | b |\n|---|---|\n| 1 | 2 |\n",
         "howto/three.md": "# <b>Three</b>\n\n<script>alert(1)</script> [x](javascript:alert(1)) [w](https://example.org)\n",
+        "howto/equation.md": "# Equation\n\n```math\nz = \\frac{c_0 + c_1 \\phi}{1 + c_2 \\phi}\n```\n",
         "howto/index.md": "# Index\n",
         "architecture.md": "# Architecture\n",
         "examples/a.py": "print()\n",
@@ -63,7 +64,7 @@ def test_only_listed_files_are_served(operator, name):
 
 def test_pages_are_those_of_the_users_folders(folder):
     pages = HelpPages(folder)
-    assert pages.names == ("howto/one.md", "howto/three.md", "explanation/two.md")
+    assert pages.names == ("howto/equation.md", "howto/one.md", "howto/three.md", "explanation/two.md")
     assert pages.file("howto/rig.png").content == PNG
     hidden = ("howto/index.md", "architecture.md", "examples/a.py", "../secret.md", "/etc/passwd", "howto/")
     assert not any(pages.file(name) for name in hidden)
@@ -97,3 +98,9 @@ def test_comments_of_a_page_are_not_shown(folder):
     (folder / "howto" / "four.md").write_text(text)
     shown = HelpPages(folder).file("howto/four.md").content.decode()
     assert "It is 0.2 mm." in shown and "&lt;!--" not in shown and "not run" not in shown and "<code" in shown
+
+
+def test_an_equation_is_drawn_with_its_source_for_screen_readers(folder):
+    html = HelpPages(folder).file("howto/equation.md").content.decode()
+    assert "<code" not in html and html.count("<svg") == 1 and r'aria-label="z = \frac{c_0' in html
+    assert len(re.findall("M", re.findall(r' d="([^"]+)"', html)[0])) > 10  # the outlines of its letters
