@@ -7,6 +7,7 @@ animated, and `docs/images/wizard_*.png`.
 """
 
 import re
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -74,7 +75,9 @@ def write_animation(shots: list[Path], path: Path) -> None:
 def main() -> None:
     """Start the wizard on loopback, drive it, and write the pictures."""
     with tempfile.TemporaryDirectory() as folder, sync_playwright() as playwright:
-        command = [sys.executable, "-m", "slviewer.cli", "wizard", f"{folder}/first-session", "--port", "0"]
+        scans = Path(tempfile.gettempdir(), "scans")  # a name that may be shown
+        scans.mkdir()
+        command = [sys.executable, "-m", "slviewer.cli", "wizard", f"{scans}/first-session", "--port", "0"]
         server = subprocess.Popen([*command, "--no-browser"], stdout=subprocess.PIPE, text=True, cwd=folder)
         try:
             assert server.stdout is not None
@@ -87,12 +90,14 @@ def main() -> None:
             page.get_by_text("Software WebGL rendering detected").locator(
                 "xpath=ancestor::*[.//button][1]//button"
             ).first.click()
+            page.get_by_text("Preparing,").first.wait_for(state="hidden", timeout=1000 * LONGEST_S)
             page.screenshot(path=Path(folder) / "start.png")
             shots = draw_autopilot(page, Path(folder))
             browser.close()
         finally:
             server.terminate()
             server.wait(30)
+            shutil.rmtree(scans)
         by_step: dict[str, list[Path]] = {"start": [Path(folder) / "start.png"]}
         for step, path in shots:
             by_step.setdefault(step, []).append(path)
