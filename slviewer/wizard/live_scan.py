@@ -25,6 +25,7 @@ from slviewer.reconstruction.onepass_cuda import has_pass, one_pass
 from slviewer.reconstruction.reconstruct import Model
 from slviewer.session.store import Session
 from slviewer.wizard.acquisition import Acquisition
+from slviewer.wizard.jobs import release_memory
 from slviewer.wizard.live_frames import LiveCapture, Stream
 from slviewer.wizard.live_motion import mask_motion
 from slviewer.wizard.notices import Notices
@@ -33,6 +34,7 @@ from slviewer.wizard.snapshot import LiveView
 REPORTS_PER_S = 3.0
 _AVERAGED_S = 2.0  # rates are averages over this time
 _RELOAD_S = 1.0  # between two checks whether the calibration has changed
+_RELEASE_S = 30.0  # between two releases of freed memory
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,6 +112,7 @@ class LiveScan:
 
     def _serve(self) -> None:
         """Compute and publish a cloud of each new capture until the stream ends; a failure ends it with a notice."""
+        released = time.monotonic()
         while (shot := self.stream.wait_next()) is not None:
             try:
                 cloud = self._compute_cloud(shot)
@@ -127,6 +130,9 @@ class LiveScan:
             if now - self._reported > 1 / REPORTS_PER_S:
                 self._reported = now
                 self._changed()
+            if now - released > _RELEASE_S:
+                released = now
+                release_memory()
 
     def _compute_cloud(self, shot: LiveCapture) -> LiveCloud:
         """Reconstruct a capture with the current calibration."""

@@ -1,13 +1,16 @@
 """The worker: order, progress, cancelling what cannot be interrupted, and failures that stay sentences."""
 
+import os
+import platform
 import threading
 import time
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
 from slviewer.errors import CalibrationRejected, Cancelled
-from slviewer.wizard.jobs import Jobs
+from slviewer.wizard.jobs import Jobs, release_memory
 from slviewer.wizard.notices import Notices
 
 
@@ -152,3 +155,18 @@ def test_closing_ends_everything(notices: Notices) -> None:
     assert time.monotonic() - begun < 1.5
     jobs.submit("Too late", lambda report: None)
     assert not any(thread.name == "slviewer worker" and thread.is_alive() for thread in threading.enumerate())
+
+
+def read_memory_mb() -> float:
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other C libraries are left alone")
+def test_memory_freed_between_blocks_in_use_is_returned() -> None:
+    blocks = [b"x" * 100_000 for _ in range(2000)]  # smaller than what the system gives in whole pages
+    in_use = blocks[::20]
+    del blocks
+    before = read_memory_mb()
+    release_memory()
+    assert 100 < before - read_memory_mb() < 250, len(in_use)
