@@ -11,7 +11,7 @@ from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 
-from slviewer.errors import DeviceError, InputError
+from slviewer.errors import DeviceError, InputError, SlviewerError
 from slviewer.fringe.layout import clip_level
 from slviewer.fringe.sequence import PatternSequence
 
@@ -217,9 +217,11 @@ class Rig:
 
     def open(self) -> None:
         """Open both devices, or neither. Raises DeviceError."""
-        self.projector.open()
+        with report_driver_faults(self.projector):
+            self.projector.open()
         try:
-            self.camera.open()
+            with report_driver_faults(self.camera):
+                self.camera.open()
         except BaseException:
             self.projector.close()
             raise
@@ -228,6 +230,19 @@ class Rig:
         """Close both devices; never raises."""
         self.camera.close()
         self.projector.close()
+
+
+@contextmanager
+def report_driver_faults(device: Camera | Projector | Turntable) -> Iterator[None]:
+    """Raise DeviceError, which names the device, for what its driver may not raise: anything but our own errors."""
+    try:
+        yield
+    except SlviewerError:
+        raise
+    except Exception as error:  # a driver's own fault, as of a plugin
+        raise DeviceError(
+            f"the driver of {device.name} failed with {type(error).__name__}: {error}; report it to the driver's maker"
+        ) from error
 
 
 def check_frame(camera: Camera, out: np.ndarray) -> None:

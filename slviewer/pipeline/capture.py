@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from slviewer.devices.capture import CapturedFrames, capture_with_texture, check_exposures
-from slviewer.devices.protocols import CameraSettings, Rig, stated_full_scale
+from slviewer.devices.protocols import CameraSettings, Rig, report_driver_faults, stated_full_scale
 from slviewer.errors import InputError, SessionError, SlviewerError
 from slviewer.fringe.presets import PRESETS
 from slviewer.fringe.sequence import Axis, PatternSequence
@@ -132,7 +132,8 @@ def set_camera(rig: Rig, choice: Mapping[str, Any], exposure_ms: float | None, g
     """Set the open rig's camera to the requested values, else to those of its choice; warns of those refused."""
     wanted = camera_settings(choice, exposure_ms, gain)
     if wanted != CameraSettings():
-        rig.camera.apply(wanted)
+        with report_driver_faults(rig.camera):
+            rig.camera.apply(wanted)
     for note in getattr(rig.camera, "notes", ()):
         warn(note)
 

@@ -50,7 +50,7 @@ def check_exposure(bench: RigUnderTest) -> tuple[Check, float | None]:
     bright = float(np.quantile(level, 0.995))
     clipped = float(np.mean(level >= 0.985 * full))
     black = float(np.median(bench.dark[bench.illuminated]))
-    present = bench.rig.camera.settings().exposure_ms
+    present = bench.read_exposure_ms()
     factor = _SATURATED_FACTOR if bright >= 0.985 * full else (_TARGET_LEVEL * full - black) / max(bright - black, 1.0)
     wanted = None if present is None else _round_ms(present * factor)
     figures = {
@@ -172,7 +172,7 @@ def check_flicker(bench: RigUnderTest, burst: Burst) -> Check:
     )
     swing = float(np.sqrt(max(0.0, float(np.var(white_rest)) - noise**2)))
     ambient = float(np.sqrt(max(0.0, float(np.var(dark_rest)) - noise**2)))
-    present = bench.rig.camera.settings().exposure_ms
+    present = bench.read_exposure_ms()
     hertz = _identify_mains(white_rest, burst.white_s)
     figures = {
         "rms_in_white": round(swing, 5),
