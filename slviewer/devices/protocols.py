@@ -86,6 +86,32 @@ class ColourCamera(Camera, Protocol):
         ...
 
 
+_SETTING_TOLERANCE = 0.1
+"""Share by which an applied setting may differ from the requested one: cameras round to their steps."""
+
+
+def list_notes(camera: Camera) -> tuple[str, ...]:
+    """Return a camera's own `notes`, one for each setting that it refused, where its driver has them."""
+    return tuple(getattr(camera, "notes", ()))
+
+
+def list_changed_settings(camera: Camera, wanted: CameraSettings, applied: CameraSettings) -> tuple[str, ...]:
+    """Return a sentence for each setting that the camera changed noticeably, unless its own `notes` report it."""
+    sentences = []
+    for what, unit, value, in_effect in (
+        ("an exposure", " ms", wanted.exposure_ms, applied.exposure_ms),
+        ("a gain", "", wanted.gain, applied.gain),
+    ):
+        if value is None or in_effect is None or abs(in_effect - value) <= _SETTING_TOLERANCE * value:
+            continue
+        if not any(f"{value:g}{unit}" in note for note in list_notes(camera)):
+            sentences.append(
+                f"{camera.name} took {what} of {in_effect:g}{unit} in place of {value:g}{unit}: "
+                "give one that it supports"
+            )
+    return tuple(sentences)
+
+
 def find_full_scale(camera: Camera, largest: int) -> float:
     """Return the grey level at which a camera clips: its own statement, else by the largest level of an image."""
     return clip_level(camera.dtype, largest, stated_full_scale(camera))
