@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slviewer.devices.protocols import CameraSettings, ColourCamera, Rig
-from slviewer.errors import DeviceError, InputError, SlviewerError
+from slviewer.devices.protocols import CameraSettings, ColourCamera, Rig, report_driver_faults
+from slviewer.errors import DeviceError, InputError
 from slviewer.fringe.sequence import PatternSequence
 
 MAX_EXPOSURES = 8
@@ -27,7 +27,8 @@ def capture(
     DeviceError, with the frame at which it happened; whatever is raised, `out` then holds no capture and the rig can be
     used again once its device answers. The projector is left showing the last frame.
     """
-    rig.projector.load(sequence)
+    with report_driver_faults(rig.projector):
+        rig.projector.load(sequence)
     out = _allocate(rig, len(sequence.frames), out)
     _capture_loaded(rig, len(sequence.frames), out, progress)
     return out
@@ -52,22 +53,17 @@ def _capture_loaded(rig: Rig, n: int, out: np.ndarray, progress: Callable[[int, 
         progress(0, n)
     for k in range(n):
         try:
-            rig.projector.show(k)
+            with report_driver_faults(rig.projector):
+                rig.projector.show(k)
             settle(rig)
-            rig.camera.grab(out[k])
+            with report_driver_faults(rig.camera):
+                rig.camera.grab(out[k])
             if k == n - 1:
-                rig.projector.show(k)  # a change during this exposure is reported by the next request only
+                with report_driver_faults(rig.projector):
+                    rig.projector.show(k)  # a change during this exposure is reported by the next request only
         except DeviceError as error:
             raise DeviceError(
                 f"the capture ended at frame {k + 1} of {n}, and its frames were discarded: {error}"
-            ) from error
-        except SlviewerError:
-            raise
-        except Exception as error:  # a driver's own fault, as of a plugin
-            raise DeviceError(
-                f"the capture ended at frame {k + 1} of {n}, and its frames were discarded: the driver of "
-                f"{rig.camera.name} or {rig.projector.name} failed with {type(error).__name__}: {error}; report it to "
-                "the driver's maker"
             ) from error
         if progress is not None:
             progress(k + 1, n)
@@ -100,12 +96,13 @@ def capture_with_texture(
     """
     if not exposures_ms:
         frames = capture(rig, sequence, out, progress)
-        return CapturedFrames(frames, rig.camera.settings(), (), _try_capture_texture(rig))
+        return CapturedFrames(frames, _read_settings(rig), (), _try_capture_texture(rig))
     wanted = check_exposures(exposures_ms)
     n = len(sequence.frames)
     out = _allocate(rig, n * len(wanted), out)
-    rig.projector.load(sequence)  # once: a projector reconnected between two exposures must not go unnoticed
-    before, applied_ms = rig.camera.settings(), []
+    with report_driver_faults(rig.projector):
+        rig.projector.load(sequence)  # once: a projector reconnected between two exposures must not go unnoticed
+    before, applied_ms = _read_settings(rig), []
     try:
         for e, exposure in enumerate(wanted):
             applied_ms.append(_set_exposure(rig, exposure))
@@ -116,9 +113,9 @@ def capture_with_texture(
                 )
             _capture_loaded(rig, n, out[e * n : (e + 1) * n], _offset_progress(progress, e * n, len(out)))
     finally:
-        with contextlib.suppress(DeviceError):  # a lost device raises its own error
+        with contextlib.suppress(DeviceError), report_driver_faults(rig.camera):  # a lost device raises its own error
             rig.camera.apply(before)
-    return CapturedFrames(out, rig.camera.settings(), tuple(applied_ms), _try_capture_texture(rig))
+    return CapturedFrames(out, _read_settings(rig), tuple(applied_ms), _try_capture_texture(rig))
 
 
 def check_exposures(exposures_ms: Sequence[float]) -> list[float]:
@@ -133,14 +130,21 @@ def check_exposures(exposures_ms: Sequence[float]) -> list[float]:
 
 def _try_capture_texture(rig: Rig) -> np.ndarray | None:
     """Capture the colour texture (h, w, 3); None also on a DeviceError: the frames are complete without it."""
-    with contextlib.suppress(DeviceError):
+    with report_driver_faults(rig.camera), contextlib.suppress(DeviceError):
         return capture_texture(rig)
     return None
 
 
+def _read_settings(rig: Rig) -> CameraSettings:
+    """Return the camera's settings. Raises DeviceError."""
+    with report_driver_faults(rig.camera):
+        return rig.camera.settings()
+
+
 def _set_exposure(rig: Rig, exposure_ms: float) -> float:
     """Set the exposure; returns the value, ms, that the camera applied. Raises DeviceError where it is unknown."""
-    applied_ms = rig.camera.apply(CameraSettings(exposure_ms)).exposure_ms
+    with report_driver_faults(rig.camera):
+        applied_ms = rig.camera.apply(CameraSettings(exposure_ms)).exposure_ms
     if applied_ms is None:
         raise DeviceError(f"{rig.camera.name} does not report its exposure: capture in a single one")
     return applied_ms

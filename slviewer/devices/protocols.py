@@ -11,7 +11,7 @@ from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 
-from slviewer.errors import DeviceError, InputError
+from slviewer.errors import DeviceError, InputError, SlviewerError
 from slviewer.fringe.layout import clip_level
 from slviewer.fringe.sequence import PatternSequence
 
@@ -84,6 +84,32 @@ class ColourCamera(Camera, Protocol):
     def grab_colour(self) -> np.ndarray:
         """Grab a new (h, w, 3) RGB frame of `dtype`, exposed as `grab` requires."""
         ...
+
+
+_SETTING_TOLERANCE = 0.1
+"""Share by which an applied setting may differ from the requested one: cameras round to their steps."""
+
+
+def list_notes(camera: Camera) -> tuple[str, ...]:
+    """Return a camera's own `notes`, one for each setting that it refused, where its driver has them."""
+    return tuple(getattr(camera, "notes", ()))
+
+
+def list_changed_settings(camera: Camera, wanted: CameraSettings, applied: CameraSettings) -> tuple[str, ...]:
+    """Return a sentence for each setting that the camera changed noticeably, unless its own `notes` report it."""
+    sentences = []
+    for what, unit, value, in_effect in (
+        ("an exposure", " ms", wanted.exposure_ms, applied.exposure_ms),
+        ("a gain", "", wanted.gain, applied.gain),
+    ):
+        if value is None or in_effect is None or abs(in_effect - value) <= _SETTING_TOLERANCE * value:
+            continue
+        if not any(f"{value:g}{unit}" in note for note in list_notes(camera)):
+            sentences.append(
+                f"{camera.name} took {what} of {in_effect:g}{unit} in place of {value:g}{unit}: "
+                "give one that it supports"
+            )
+    return tuple(sentences)
 
 
 def find_full_scale(camera: Camera, largest: int) -> float:
@@ -217,9 +243,11 @@ class Rig:
 
     def open(self) -> None:
         """Open both devices, or neither. Raises DeviceError."""
-        self.projector.open()
+        with report_driver_faults(self.projector):
+            self.projector.open()
         try:
-            self.camera.open()
+            with report_driver_faults(self.camera):
+                self.camera.open()
         except BaseException:
             self.projector.close()
             raise
@@ -228,6 +256,19 @@ class Rig:
         """Close both devices; never raises."""
         self.camera.close()
         self.projector.close()
+
+
+@contextmanager
+def report_driver_faults(device: Camera | Projector | Turntable) -> Iterator[None]:
+    """Raise DeviceError, which names the device, for what its driver may not raise: anything but our own errors."""
+    try:
+        yield
+    except SlviewerError:
+        raise
+    except Exception as error:  # a driver's own fault, as of a plugin
+        raise DeviceError(
+            f"the driver of {device.name} failed with {type(error).__name__}: {error}; report it to the driver's maker"
+        ) from error
 
 
 def check_frame(camera: Camera, out: np.ndarray) -> None:

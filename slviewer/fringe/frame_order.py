@@ -206,11 +206,13 @@ def _list_orders(sequence: PatternSequence) -> Iterator[tuple[Images, Contradict
         images = tuple(i + lag if 0 <= i + lag < n else None for i in range(n))
         count = "one image" if abs(lag) == 1 else f"{abs(lag)} images"
         way = (
-            "late, so that each shows the pattern before its own: let the camera wait longer after each pattern"
+            "late, so that each shows the pattern before its own: let the camera wait longer after each pattern, or "
+            "switch its buffering off, where it hands out old images (the preflight shows which)"
             if lag > 0
-            else "early, so that each shows the pattern after its own: the first frame is missing"
+            else "early, so that each shows the pattern after its own, and the first is missing: let the camera begin "
+            "with the first pattern"
         )
-        text = f"all frames are {count} {way}, and capture again, or move the files by {count}"
+        text = f"all frames are {count} {way}; capture again, or move the files by {count}"
         # Without its first bit an inverted code is a code as well: the fewer images are lost, the better.
         yield images, Contradiction("frame-lag", text, None, float(lag)), 0.04 * (abs(lag) - 1)
     for k in range(n - 1):

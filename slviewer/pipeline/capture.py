@@ -9,7 +9,14 @@ from typing import Any
 import numpy as np
 
 from slviewer.devices.capture import CapturedFrames, capture_with_texture, check_exposures
-from slviewer.devices.protocols import CameraSettings, Rig, stated_full_scale
+from slviewer.devices.protocols import (
+    CameraSettings,
+    Rig,
+    list_changed_settings,
+    list_notes,
+    report_driver_faults,
+    stated_full_scale,
+)
 from slviewer.errors import InputError, SessionError, SlviewerError
 from slviewer.fringe.presets import PRESETS
 from slviewer.fringe.sequence import Axis, PatternSequence
@@ -110,6 +117,9 @@ def capture(
                 exposures,
                 progress=lambda done, n: progress(begin + (0.95 - begin) * done / n, f"{name}: frame {done} of {n}"),
             )
+        for wanted_ms, applied_ms in zip(exposures, captured.exposures_ms, strict=True):
+            for note in list_changed_settings(devices.camera, CameraSettings(wanted_ms), CameraSettings(applied_ms)):
+                warn(note)
         progress(0.95, "saving")
         purpose = "pose" if role == "calibration" else "scan"
         shown = str(target) if target is not None and role == "calibration" else None
@@ -129,11 +139,14 @@ def capture(
 
 
 def set_camera(rig: Rig, choice: Mapping[str, Any], exposure_ms: float | None, gain: float | None, warn: Warn) -> None:
-    """Set the open rig's camera to the requested values, else to those of its choice; warns of those refused."""
-    wanted = camera_settings(choice, exposure_ms, gain)
-    if wanted != CameraSettings():
-        rig.camera.apply(wanted)
-    for note in getattr(rig.camera, "notes", ()):
+    """Set the open rig's camera to the requested values, else to those of its choice; warns of those refused or
+    changed."""
+    wanted = applied = camera_settings(choice, exposure_ms, gain)
+    with report_driver_faults(rig.camera):
+        if wanted != CameraSettings():
+            applied = rig.camera.apply(wanted)
+        notes = (*list_notes(rig.camera), *list_changed_settings(rig.camera, wanted, applied))
+    for note in notes:
         warn(note)
 
 

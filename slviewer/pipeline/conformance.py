@@ -51,6 +51,8 @@ def _inspect_camera(faults: list[str], camera: Camera) -> None:
         if np.count_nonzero(untouched) > frame.size // 1000:  # some may have these levels in truth
             faults.append(f"grab left {np.count_nonzero(untouched)} of {frame.size} pixels as they were: fill them all")
         largest, stated = int(np.max(frames)), stated_full_scale(camera)
+        if stated is None and camera.dtype == np.uint16:
+            faults.append("full_scale is missing: state the grey level at which the camera clips, such as 4095")
         if stated is not None and not largest <= stated <= np.iinfo(camera.dtype).max:
             faults.append(f"full_scale is {stated}, and {camera.dtype} frames reach {largest}: state where they clip")
         wrong = np.zeros((height + 1, width), camera.dtype)
@@ -213,11 +215,13 @@ def _inspect_exporter(faults: list[str], exporter: Exporter) -> None:
             faults.append(f"encode of a {type(shape).__name__} does not return bytes")
 
 
-def _collect(inspect: Callable[..., None], *arguments: Any) -> list[str]:
+def _collect(inspect: Callable[..., None], plugin: Any, *arguments: Any) -> list[str]:
     """Return the faults that an inspection appends, and the exception that ends it early, if one does."""
+    if isinstance(plugin, type):
+        return [f"{plugin.__name__} is a class: give an object of it, {plugin.__name__}(...)"]
     faults: list[str] = []
     try:
-        inspect(faults, *arguments)
+        inspect(faults, plugin, *arguments)
     except Exception as error:  # whatever a plugin raises is a fault of it
         faults.append(f"the check ended early with {type(error).__name__}: {error}")
     return faults
@@ -227,8 +231,8 @@ def _check_size(device: Camera | Projector) -> list[str]:
     """List what is wrong with the name and the size of a closed device."""
     faults = [] if isinstance(device.name, str) and device.name else ["name is empty"]
     size = device.size
-    if len(size) != 2 or not all(isinstance(side, int) and side > 0 for side in size):
-        faults.append(f"size is {size!r}: it must be (width, height) px as two int")
+    if not isinstance(size, tuple) or len(size) != 2 or not all(isinstance(side, int) and side > 0 for side in size):
+        faults.append(f"size is {size!r}: it must be a tuple of two int, (width, height) px")
     return faults
 
 

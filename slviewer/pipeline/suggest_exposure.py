@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slviewer.devices.capture import settle
-from slviewer.devices.protocols import CameraSettings, Rig, find_full_scale
+from slviewer.devices.protocols import CameraSettings, Rig, find_full_scale, report_driver_faults
 from slviewer.errors import DeviceError, InputError
 from slviewer.fringe.layout import Layout, axis_layout
 from slviewer.fringe.limits import DARK_LEVELS
@@ -221,7 +221,8 @@ class _Bracket:
 
     def _look(self, exposure_ms: float) -> _Look:
         """Capture the fringes in the exposure that the camera has nearest to this one, unless that was done."""
-        set_ms = self._rig.camera.apply(CameraSettings(exposure_ms)).exposure_ms
+        with report_driver_faults(self._rig.camera):
+            set_ms = self._rig.camera.apply(CameraSettings(exposure_ms)).exposure_ms
         if set_ms is None:
             raise DeviceError(f"{self._rig.camera.name} does not report its exposure: set it by hand, at the camera")
         if set_ms in self._looks:
@@ -230,9 +231,11 @@ class _Bracket:
         self._progress(min(0.95, self._grabs / (2 * _MAX_LOOKS)), f"fringes at {set_ms:g} ms")
         begun, images = time.monotonic(), []
         for index in (*self._indices, self._indices[-1]):
-            self._rig.projector.show(index)
+            with report_driver_faults(self._rig.projector):
+                self._rig.projector.show(index)
             settle(self._rig)
-            self._rig.camera.grab(self._frame)
+            with report_driver_faults(self._rig.camera):
+                self._rig.camera.grab(self._frame)
             image = self._frame[:: self._stride, :: self._stride]
             self._largest = max(self._largest, int(image.max()))
             images.append(image.astype(np.float32))

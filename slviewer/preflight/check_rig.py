@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
 
-from slviewer.devices.protocols import Rig
+from slviewer.devices.protocols import Rig, report_driver_faults
 from slviewer.errors import DeviceError
 from slviewer.pipeline.capture import set_camera
 from slviewer.pipeline.check_results import Check, CheckName, Preflight
@@ -54,12 +54,13 @@ def check_rig(
             choice = load_rig(rig, store)
     progress(0.0, "opening the devices")
     with set_up(choice, None).rig.opened() as devices:
-        before = devices.camera.settings()
+        with report_driver_faults(devices.camera):
+            before = devices.camera.settings()
         set_camera(devices, choice, exposure_ms, gain, warn)
         try:
             return preflight(devices, progress=progress)
         finally:  # a camera may keep what it was checked with
-            with suppress(DeviceError):
+            with suppress(DeviceError), report_driver_faults(devices.camera):
                 devices.camera.apply(before)
 
 

@@ -50,7 +50,7 @@ def check_exposure(bench: RigUnderTest) -> tuple[Check, float | None]:
     bright = float(np.quantile(level, 0.995))
     clipped = float(np.mean(level >= 0.985 * full))
     black = float(np.median(bench.dark[bench.illuminated]))
-    present = bench.rig.camera.settings().exposure_ms
+    present = bench.read_exposure_ms()
     factor = _SATURATED_FACTOR if bright >= 0.985 * full else (_TARGET_LEVEL * full - black) / max(bright - black, 1.0)
     wanted = None if present is None else _round_ms(present * factor)
     figures = {
@@ -61,17 +61,21 @@ def check_exposure(bench: RigUnderTest) -> tuple[Check, float | None]:
         "suggested_exposure_ms": wanted,
         "suggested_factor": round(factor, 2),
     }
-    change = f"by {factor:.2g} times" if wanted is None else f"from {present:g} ms to {wanted:g} ms"
+    change = (
+        f"Multiply the exposure by {factor:.2g}"
+        if wanted is None
+        else f"Change the exposure from {present:g} ms to {wanted:g} ms"
+    )
     if clipped > CLIPPED:
         verdict: CheckVerdict = "bad" if clipped > MUCH_CLIPPED else "warning"
         text = f"{100 * clipped:.1f} % of what the projector lights is saturated in white light."
         if bright < 0.985 * full:
             return Check("exposure", verdict, text, "Turn what shines, or capture with two exposures.", figures), None
-        return Check("exposure", verdict, text, f"Change the exposure {change}, then check again.", figures), wanted
+        return Check("exposure", verdict, text, f"{change}, then check again.", figures), wanted
     if bright < WEAK * full:
         verdict = "bad" if bright < TOO_WEAK * full else "warning"
         text = f"White light reaches only {100 * bright / full:.0f} % of the camera's range."
-        return Check("exposure", verdict, text, f"Change the exposure {change}, or open the aperture.", figures), wanted
+        return Check("exposure", verdict, text, f"{change}, or open the aperture.", figures), wanted
     text = f"White light reaches {100 * bright / full:.0f} % of the camera's range; {100 * clipped:.1f} % is saturated."
     return Check("exposure", "good", text, "", figures), None
 
@@ -172,7 +176,7 @@ def check_flicker(bench: RigUnderTest, burst: Burst) -> Check:
     )
     swing = float(np.sqrt(max(0.0, float(np.var(white_rest)) - noise**2)))
     ambient = float(np.sqrt(max(0.0, float(np.var(dark_rest)) - noise**2)))
-    present = bench.rig.camera.settings().exposure_ms
+    present = bench.read_exposure_ms()
     hertz = _identify_mains(white_rest, burst.white_s)
     figures = {
         "rms_in_white": round(swing, 5),

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from slviewer.devices.protocols import Rig, find_full_scale
+from slviewer.devices.protocols import Rig, find_full_scale, report_driver_faults
 
 _PIXELS = 150_000
 """So many pixels of an image are looked at."""
@@ -42,7 +42,8 @@ class RigUnderTest:
 
     def grab(self) -> np.ndarray:
         """Grab the next image, sampled."""
-        self.rig.camera.grab(self._frame)
+        with report_driver_faults(self.rig.camera):
+            self.rig.camera.grab(self._frame)
         return self._frame[:: self.stride, :: self.stride].astype(np.float32)
 
     def grab_timed(self) -> tuple[float, np.ndarray]:
@@ -62,7 +63,13 @@ class RigUnderTest:
     def show(self, grey: int | None, doing: str) -> None:
         """Project even light of a grey level, without waiting for it. May raise Cancelled."""
         self._tick(doing)
-        self.rig.projector.show_level(grey)
+        with report_driver_faults(self.rig.projector):
+            self.rig.projector.show_level(grey)
+
+    def read_exposure_ms(self) -> float | None:
+        """The camera's exposure; None where it is unknown."""
+        with report_driver_faults(self.rig.camera):
+            return self.rig.camera.settings().exposure_ms
 
     def grab_mean(self, grey: int | None, doing: str, images: int = 1) -> np.ndarray:
         """The mean of ``images`` images (h, w) under even light, after it has settled."""

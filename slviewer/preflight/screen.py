@@ -70,7 +70,10 @@ def check_pixels(bench: RigUnderTest, middle: float) -> Check:
     where = bench.usable()
     if abs(middle - 0.5) < _MIN_GREY_CONTRAST or not where.any():
         text = "Whether the display scales the patterns cannot be seen: its grey is as bright as its finest stripes."
-        return Check("pixels", "unknown", text, "", {"middle_grey": round(middle, 3)})
+        remedy = (
+            "Check in the projector's menu: native resolution, a zoom of 100 %, no keystone correction or sharpening."
+        )
+        return Check("pixels", "unknown", text, remedy, {"middle_grey": round(middle, 3)})
     size = bench.rig.projector.size
     shares = []
     for axis in ("x", "y"):

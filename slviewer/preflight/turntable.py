@@ -1,6 +1,6 @@
 """Does the turntable answer, turn, and come back?"""
 
-from slviewer.devices.protocols import Turntable
+from slviewer.devices.protocols import Turntable, report_driver_faults
 from slviewer.errors import DeviceError, InputError
 from slviewer.pipeline.check_results import Check
 
@@ -12,17 +12,18 @@ def check_turntable(table: Turntable) -> Check:
     """Open the turntable, turn it by 2 degrees and back, and close it."""
     figures: dict[str, float] = {}
     try:
-        table.open()
-        try:
-            begin_deg = table.position_deg()
-            low, high = table.limits_deg or (-float("inf"), float("inf"))
-            turned_deg = begin_deg + _TURN_DEG if begin_deg + _TURN_DEG <= high else max(low, begin_deg - _TURN_DEG)
-            table.turn_to(turned_deg)
-            error_deg = table.position_deg() - turned_deg
-            table.turn_to(begin_deg)
-            figures = {"position_deg": round(begin_deg, 3), "error_deg": round(error_deg, 3)}
-        finally:
-            table.close()
+        with report_driver_faults(table):
+            table.open()
+            try:
+                begin_deg = table.position_deg()
+                low, high = table.limits_deg or (-float("inf"), float("inf"))
+                turned_deg = begin_deg + _TURN_DEG if begin_deg + _TURN_DEG <= high else max(low, begin_deg - _TURN_DEG)
+                table.turn_to(turned_deg)
+                error_deg = table.position_deg() - turned_deg
+                table.turn_to(begin_deg)
+                figures = {"position_deg": round(begin_deg, 3), "error_deg": round(error_deg, 3)}
+            finally:
+                table.close()
     except (InputError, DeviceError) as error:
         sentence, _, remedy = str(error).rpartition(": ")
         return Check("turntable", "bad", f"{sentence}.", f"{remedy[:1].upper()}{remedy[1:]}.", figures)

@@ -17,7 +17,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from slviewer.devices.capture import CapturedFrames, capture_with_texture
-from slviewer.devices.protocols import CameraSettings, Rig, stated_full_scale
+from slviewer.devices.protocols import CameraSettings, Rig, list_changed_settings, list_notes, stated_full_scale
 from slviewer.errors import Cancelled, DeviceError, SlviewerError, TurntableError
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.pipeline.feedback import Progress
@@ -315,7 +315,7 @@ class Acquisition:
                 self._applied = actual
                 with self._condition:
                     self._settings = self._settings or actual  # another thread may have set it meanwhile
-            notes = tuple(getattr(rig.camera, "notes", ()))  # not every driver has them
+            notes = (*list_notes(rig.camera), *list_changed_settings(rig.camera, settings or actual, actual))
             self._update_view(exposure_ms=actual.exposure_ms, gain=actual.gain, notes=notes)
 
     def _grab_preview(self, rig: Rig) -> None:

@@ -65,6 +65,37 @@ def test_a_rig_that_is_not_fit_ends_with_1(
     assert json.loads((tmp_path / "found.json").read_text())["verdict"] == "bad"
 
 
+class FailingCamera(BlindCamera):
+    """Fails in the way of its maker's library, not of slviewer."""
+
+    fault: Exception
+
+    def grab(self, out: np.ndarray) -> None:
+        raise self.fault
+
+
+@pytest.mark.parametrize("fault", [OSError("vendor error 0x17"), TypeError("grab() takes no array")])
+@pytest.mark.parametrize("command", [["preflight"], ["capture", "session", "one"]], ids=["preflight", "capture"])
+def test_a_fault_of_a_driver_is_named_as_such(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    command: list[str],
+    fault: Exception,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(FailingCamera, "fault", fault, raising=False)
+    lamp = preset_rig(scale=0.1).projector
+    monkeypatch.setitem(
+        drivers(), "failing", Driver("failing", "nothing", camera=FailingCamera, projector=lambda: lamp)
+    )
+    Path("failing.toml").write_text(to_toml({"camera": {"driver": "failing"}, "projector": {"driver": "failing"}}))
+    assert main([*command, "--rig", "failing.toml"]) == 1
+    message = " ".join(capsys.readouterr().err.split())
+    assert f"the driver of the blind camera failed with {type(fault).__name__}: {fault}" in message
+    assert "report it to the driver's maker" in message
+
+
 def test_a_rig_that_is_none_is_named(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["preflight", "--rig", "nothing"]) == 1
     assert "'nothing'" in capsys.readouterr().err

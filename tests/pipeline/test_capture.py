@@ -9,10 +9,11 @@ from colour_camera import coloured
 
 from slviewer.cli import main
 from slviewer.devices.drivers import Driver, drivers
+from slviewer.devices.simulated import preset_rig
 from slviewer.errors import Cancelled, DeviceError, InputError, SessionError
 from slviewer.fringe.decode import decode
 from slviewer.fringe.presets import p18
-from slviewer.pipeline.capture import capture
+from slviewer.pipeline.capture import capture, set_camera
 from slviewer.pipeline.capture_phases import capture_texture
 from slviewer.pipeline.rig_choice import RigSetup, set_up
 from slviewer.session.store import Session
@@ -212,6 +213,22 @@ def test_a_capture_that_is_saved_outlives_the_look_at_its_frames(tmp_path: Path,
     assert said == ["b is saved, and its frames could not be checked: the disk is full: free some space"]
     with Session.open(tmp_path / "fresh") as store:
         assert [len(shot.frames) for shot in store.captures()] == [32, 32]
+
+
+def test_what_the_camera_took_in_place_of_a_setting_is_reported(tmp_path: Path):
+    rig = preset_rig(scale=0.1)
+    said: list[str] = []
+    with rig.opened():
+        set_camera(rig, {"exposure_ms": 1000.0}, None, 20.0, said.append)
+        assert len(said) == 2 and "100 ms in place of 1000 ms" in said[0] and "16 in place of 20" in said[1]
+        said.clear()
+        set_camera(rig, {}, 105.0, None, said.append)  # rounding by a few percent is normal
+        rig.camera.notes = ("its exposure is 100 ms, 1000 ms were requested",)  # type: ignore[attr-defined]
+        set_camera(rig, {}, 1000.0, None, said.append)
+    assert said == ["its exposure is 100 ms, 1000 ms were requested"]
+    said.clear()
+    capture(tmp_path / "fresh", "a", {"driver": "simulated", "scale": 0.1}, exposures_ms=[0.5, 1000], warn=said.append)
+    assert any("100 ms in place of 1000 ms" in text for text in said)
 
 
 def test_a_driver_that_fails_in_its_own_way_hides_no_other(monkeypatch: pytest.MonkeyPatch):

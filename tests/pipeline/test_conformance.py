@@ -90,6 +90,14 @@ class UnderstatesItsFullScale(Camera):
     full_scale = 64
 
 
+class StatesNoFullScale(Camera):
+    dtype = np.dtype(np.uint16)
+
+
+class SizeInAList(Camera):
+    size = [64, 48]  # type: ignore[assignment]  # noqa: RUF012
+
+
 def test_a_good_camera_has_no_fault():
     assert check_camera(Camera()) == []
     rig = simulated_rig(SimulatedWorld(letter(0.1)))
@@ -106,12 +114,19 @@ def test_a_good_camera_has_no_fault():
         (CloseRaises(), "the library is gone"),
         (AppliesNothing(), "apply does not return CameraSettings"),
         (UnderstatesItsFullScale(), "full_scale is 64"),
+        (StatesNoFullScale(), "full_scale is missing"),
+        (SizeInAList(), "size is [64, 48]: it must be a tuple"),
         (Nameless(), "name is empty"),
         (Nameless(), "dtype is 'uint16'"),
     ],
 )
 def test_the_faults_of_a_bad_camera_are_listed(camera, named):
     assert any(named in fault for fault in check_camera(camera))
+
+
+@pytest.mark.parametrize("check", [check_camera, check_projector, check_turntable, check_exporter])
+def test_a_class_in_place_of_an_object_is_named(check):
+    assert check(Camera) == ["Camera is a class: give an object of it, Camera(...)"]
 
 
 def layout(describe=None, is_capture=None):

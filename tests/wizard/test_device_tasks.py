@@ -159,6 +159,9 @@ def test_what_the_camera_could_not_be_set_to_is_seen(bench: Bench) -> None:
     bench.rig.camera.notes = ("its gain cannot be set",)  # type: ignore[attr-defined]
     bench.open()
     assert bench.acquisition.view().notes == ("its gain cannot be set",)
+    bench.acquisition.set_camera(CameraSettings(1000.0, 1.0))
+    bench.until(lambda: bench.acquisition.view().exposure_ms == 100)
+    assert any("100 ms in place of 1000 ms" in note for note in bench.acquisition.view().notes)
 
 
 def test_another_rig_ends_what_the_one_before_was_doing(bench: Bench) -> None:

@@ -35,7 +35,8 @@ RIPPLE_PEAK = 2.0
 """Peak of a ripple over its RMS."""
 
 _ORDER_REMEDY: dict[Cause, str] = {
-    "frame-lag": "let the camera wait longer after each pattern (the preflight measures the delay), and capture again",
+    "frame-lag": "let the camera wait longer after each pattern, or switch its buffering off (the preflight shows "
+    "which), and capture again",
     "missing-frame": "trigger the camera by the projector or wait longer for each frame, and capture again; of "
     "imported frames, look for the file that is missing",
     "frame-order": "run the preflight, and capture again",

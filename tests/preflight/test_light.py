@@ -1,0 +1,33 @@
+"""The remedies of a wrong exposure and of what no check can see are sentences that can be acted on."""
+
+import numpy as np
+import pytest
+
+from slviewer.devices.protocols import CameraSettings
+from slviewer.devices.simulated import preset_rig
+from slviewer.preflight.light import check_exposure
+from slviewer.preflight.rig_under_test import RigUnderTest
+from slviewer.preflight.screen import check_pixels
+
+
+@pytest.mark.parametrize(
+    ("level", "exposure_ms", "remedy"),
+    [
+        (255, None, "Multiply the exposure by 0.5, then check again."),
+        (255, 8.0, "Change the exposure from 8 ms to 4 ms, then check again."),
+        (25, None, "Multiply the exposure by 8.7, or open the aperture."),
+    ],
+)
+def test_the_remedy_of_an_exposure(
+    monkeypatch: pytest.MonkeyPatch, level: float, exposure_ms: float | None, remedy: str
+) -> None:
+    bench = RigUnderTest(preset_rig(scale=0.1), lambda doing: None)
+    monkeypatch.setattr(bench.rig.camera, "settings", lambda: CameraSettings(exposure_ms))
+    bench.white[:], bench.illuminated[:] = level, True
+    assert check_exposure(bench)[0].remedy == remedy
+
+
+def test_what_cannot_be_seen_of_the_pixels_has_a_remedy() -> None:
+    check = check_pixels(RigUnderTest(preset_rig(scale=0.1), lambda doing: None), 0.5)
+    assert check.verdict == "unknown" and "native resolution" in check.remedy
+    assert np.isclose(check.figures["middle_grey"], 0.5)
