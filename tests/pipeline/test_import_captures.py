@@ -45,7 +45,7 @@ def test_an_import_that_is_repeated_adds_what_is_missing(run: Run, tmp_path: Pat
     chunk = session / "captures/capture_1/frames.zarr/c.2.0.0"
     sound = chunk.read_bytes()
     status, out, err = run("import", "procam-calibration", tmp_path / "source", session, *options)
-    assert status == 0 and "3 captures imported" in out and "not imported again: capture_1\n" in err
+    assert status == 0 and "3 captures imported as target poses" in out and "not imported again: capture_1\n" in err
     assert not (session / "trash").exists()
     chunk.write_bytes(sound[:100] + bytes(len(sound) - 100))  # the remedy for damage is to import again
     status, _, err = run("import", "procam-calibration", tmp_path / "source", session, *options)
@@ -73,7 +73,7 @@ def faulty(tmp_path: Path) -> Path:
 def test_readable_captures_are_imported_and_the_others_named(faulty: Path, run: Run, tmp_path: Path) -> None:
     session = tmp_path / "session"
     status, out, err = run("import", "procam-calibration", faulty, session, "--projector", "120x90")
-    assert status == 0 and "2 captures imported: capture_0, capture_4" in out
+    assert status == 0 and "2 captures imported as target poses: capture_0, capture_4" in out
     warnings = [line for line in err.splitlines() if line.startswith("warning: not imported")]
     assert len(warnings) == 3
     for name, fact in (("capture_1", "graycode_03.png"), ("capture_2", "graycode_07"), ("capture_3", "modulation")):
@@ -153,7 +153,8 @@ def test_exposures_of_a_toml_become_those_of_the_session(run: Run, tmp_path: Pat
 
 def test_a_projector_size_that_is_not_stated_is_said(run: Run, tmp_path: Path) -> None:
     source, session = write_colour(tmp_path / "source"), tmp_path / "session"
-    status, _, err = run("import", "auto", source, session, "--role", "scan")
+    status, out, err = run("import", "auto", source, session, "--role", "scan")
+    assert "1 capture imported as a scan: scan" in out
     assert status == 0 and "projector" in err and "not stated" in err
     status, out, _ = run("inspect", session)
     assert status == 0 and "unknown size" in out
