@@ -11,6 +11,7 @@ from slviewer.fringe import presets
 from slviewer.fringe.sequence import Frame
 from slviewer.session.importers import frames as frames_layout
 from slviewer.session.importers import p18, procam_calibration
+from slviewer.session.importers.imported import check_complete
 
 
 def image(seed: int, dtype=np.uint8) -> np.ndarray:
@@ -166,6 +167,25 @@ def test_procam_calibration_counts(tmp_path):
     (tmp_path / "capture_0/graycode_17.png").unlink()
     with pytest.raises(InputError, match=r"capture_0.*graycode_17"):
         procam_calibration.LAYOUT.read(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("form", "first", "missing", "named"),
+    [
+        ("{:04d}", 1, 3, "shot_0003:"),
+        ("{:04d}", 1, 6, "shot_0006:"),
+        ("{}", 0, 2, "shot_2:"),
+        ("{:02d}", 0, 0, "shot_00:"),
+    ],
+)
+def test_missing_images_are_named_as_the_others(form, first, missing, named):
+    numbers = [number for number in range(first, first + 6)]
+    images = {(n,): Path(f"shot_{form.format(n)}.png") for n in numbers}
+    check_complete(images, "shot_", 6, first=first)
+    check_complete(images, "shot_", first=first)
+    del images[(missing,)]
+    with pytest.raises(InputError, match=f"lacks {named}"):
+        check_complete(images, "shot_", 6, first=first)
 
 
 def test_procam_calibration_of_a_real_rig(real_data):
