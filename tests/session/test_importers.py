@@ -260,7 +260,7 @@ def test_frames_are_what_the_toml_says(tmp_path):
 @pytest.mark.parametrize(
     ("edit", "message"),
     [
-        (lambda t: t.replace("96x64", "96"), "projector size"),
+        (lambda t: t.replace("96x64", "96"), "'96' is no size"),
         (lambda t: 'channel = "grey"\n' + t, "channel is 'grey'"),
         (lambda t: 'order = "time"\n' + t, "order is 'time'"),
         (lambda t: 'order = "name"\n' + t, r"\[\[frame\]\] 1 names files, and order"),
