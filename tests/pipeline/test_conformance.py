@@ -165,8 +165,8 @@ def rendered(tmp_path: Path) -> Path:
     [
         ({}, ""),
         ({"phase_sign": -1}, "phase_sign"),
-        ({"phase_offset_rad": 1.0}, "phase_offset"),
-        ({"gray_origin_px": 3.0}, "gray_origin"),
+        ({"phase_offset_rad": 1.0}, "phase_offset_rad"),
+        ({"gray_origin_px": 3.0}, "gray_origin_px"),
         ({"full_scale": 1023}, "1023"),
         ({"frames": (SHOWN.frames[1], SHOWN.frames[0], *SHOWN.frames[2:])}, "shot01"),
         ({"frames": (*SHOWN.frames[:6], *SHOWN.frames[:5:-1])}, "bit"),
