@@ -12,7 +12,7 @@ from slviewer.evaluation.sphere import SphereResult
 folder = sl.datasets.fetch("sample")
 session = tempfile.mkdtemp() + "/session"
 sl.import_captures(folder / "poses", session, role="calibration")
-(scan,) = sl.import_captures(folder / "sphere", session)
+(scan,) = sl.import_captures(folder / "sphere", session, role="scan")
 sl.calibrate(session, "circles:21x16:9")
 
 # The splined model alone predicts the calibration's part of the uncertainty. `verify` finds the sphere in the scan.

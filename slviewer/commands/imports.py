@@ -40,14 +40,16 @@ DESCRIBED = (
 
 
 def run_import(layout: str, import_captures: Callable[..., Any], arguments: dict[str, Any]) -> None:
-    """Import folders of a layout, and print the captures' names."""
+    """Import folders of a layout, and print the captures' role and names."""
     if layout == "detect":
         from slviewer.pipeline.import_captures import detect_layout
 
         layout = detect_layout(arguments["source"])
         terminal.print_result(f"layout {layout}")
     names = call(import_captures, layout=layout, **arguments)
-    terminal.print_result(f"{len(names)} capture{'s' * (len(names) != 1)} imported: {', '.join(names)}")
+    one, several = ("a target pose", "target poses") if arguments["role"] == "calibration" else ("a scan", "scans")
+    count = f"1 capture imported as {one}" if len(names) == 1 else f"{len(names)} captures imported as {several}"
+    terminal.print_result(f"{count}: {', '.join(names)}")
 
 
 def run_frames(import_captures: Callable[..., Any], arguments: dict[str, Any]) -> None:

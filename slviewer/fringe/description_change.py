@@ -170,7 +170,8 @@ def _describe_phase_shift(frames: AxisFrames, a: Agreement, late: float, axis: A
     share = describe_turns(2 * np.pi * late)
     shifted = Contradiction(
         "phase-offset",
-        f"the phase steps of axis {axis} begin {share} than described: set phase_offset = {offset:.3f} (rad)",
+        f"the phase steps of axis {axis} begin {share} than described: set phase_offset = {offset:.3f} (rad; "
+        "of a PatternSequence: phase_offset_rad)",
         axis,
         offset,
     )
@@ -178,7 +179,7 @@ def _describe_phase_shift(frames: AxisFrames, a: Agreement, late: float, axis: A
     moved = Contradiction(
         "gray-origin",
         f"the Gray code of axis {axis} begins {share.rsplit(' ', 1)[0]} of the fringes from where it was described: "
-        f"set gray_origin = {origin * period:.2f} (px)",
+        f"set gray_origin = {origin * period:.2f} (px; of a PatternSequence: gray_origin_px)",
         axis,
         float(origin * period),
     )
@@ -232,7 +233,8 @@ def _fit_level_offset(
         cure = f"set phase_sign = {frames.sign} and phase_offset = {offset:.3f} for axis {axis}"
         out = Contradiction("step-order", f"{text} begin elsewhere: {cure}", axis, float(frames.sign))
         return Answer((out,), sum_shares(best[2]), is_certain(best[2]))
-    out = Contradiction("phase-offset", f"{text}: set phase_offset = {offset:.3f}", axis, offset)
+    cure = f"set phase_offset = {offset:.3f} (rad; of a PatternSequence: phase_offset_rad)"
+    out = Contradiction("phase-offset", f"{text}: {cure}", axis, offset)
     return Answer((out,), sum_shares(best[2]), is_certain(best[2]))
 
 

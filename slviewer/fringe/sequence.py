@@ -233,8 +233,8 @@ class PatternSequence:
             raise InputError(f"phase_sign is {self.sign(axis)}: use 1 or -1")
         if not isfinite(self.offset_rad(axis)) or not isfinite(self.origin_px(axis)):
             raise InputError(
-                f"axis {axis}: phase_offset is {self.offset_rad(axis)} rad and gray_origin {self.origin_px(axis)} px: "
-                "give finite numbers"
+                f"axis {axis}: phase_offset (phase_offset_rad) is {self.offset_rad(axis)} rad and gray_origin "
+                f"(gray_origin_px) {self.origin_px(axis)} px: give finite numbers"
             )
         cell = _select_axis_value(self.gray_cell_px, axis)
         if cell is not None and not (isfinite(cell) and cell > 0):

@@ -7,6 +7,7 @@ Each function returns one line per fault, an empty list where there is none, so 
 import shutil
 import tempfile
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,8 @@ from slviewer.devices.protocols import Camera, CameraSettings, Projector, Turnta
 from slviewer.errors import Cancelled, DetectionError, DeviceError, InputError, SlviewerError
 from slviewer.fringe.presets import complementary, phase_steps
 from slviewer.fringe.sequence import Frame, PatternSequence
+from slviewer.pipeline.feedback import ignore_warnings
+from slviewer.pipeline.import_captures import check_imported_capture
 from slviewer.session.importers.imported import FolderLayout
 from slviewer.session.mesh_files import Exporter
 from slviewer.surface.shapes import Mesh, PointSet
@@ -137,7 +140,9 @@ def _inspect_turntable(faults: list[str], turntable: Turntable, turn_deg: float)
 def check_importer(layout: FolderLayout, capture: Path, **options: Any) -> list[str]:
     """List what a layout does wrong with a folder that holds one capture; ``options`` are those of its ``read``.
 
-    A copy of the folder without its first image, and an empty folder, must be refused or skipped with a reason.
+    Its frames are decoded and compared with their description, as an import does: use a sound capture, recorded or
+    rendered. A copy of the folder without its first image, and an empty folder, must be refused or skipped with a
+    reason.
     """
     return _collect(_inspect_importer, layout, capture, options)
 
@@ -149,10 +154,16 @@ def _inspect_importer(faults: list[str], layout: FolderLayout, capture: Path, op
         return
     imports = layout.read(capture, **options)
     faults += [] if len(imports) == 1 else [f"read finds {len(imports)} captures in {capture}, which is one"]
-    for recording, new in zip(imports.recordings, imports, strict=True):
+    for recording in imports.recordings:
         expected = len(recording.sequence.frames) * max(1, len(recording.exposures_ms))
-        if len(new.frames) != expected:
-            faults.append(f"{recording.name}: {len(new.frames)} images for {expected} frames")
+        if len(recording.files) != expected:
+            faults.append(f"{recording.name}: {len(recording.files)} images for {expected} frames")
+            continue
+        try:
+            new = recording.read()
+            check_imported_capture(replace(new, frames=new.merged_frames(), exposures_ms=()), ignore_warnings)
+        except InputError as error:
+            faults.append(str(error))
     with tempfile.TemporaryDirectory() as folder:
         empty = Path(folder) / "empty"
         empty.mkdir()

@@ -133,11 +133,15 @@ def find_captures(
         if toml is None:
             raise InputError(f"{source} holds no TOML that describes the images: add one, or give --sequence")
         options["toml"] = Path(toml)
-    elif size is None and session is not None and (size := _known_projector_size(session)) is not None:
-        warn(
-            f"the projector is assumed to have {size[0]}x{size[1]} px, as in the session: --projector for another size"
-        )
-    imports = known[layout].read(source, prefix=prefix, projector=size, **options)
+    assumed = _known_projector_size(session) if size is None and session is not None and layout != "frames" else None
+    try:
+        imports = known[layout].read(source, prefix=prefix, projector=size or assumed, **options)
+    except InputError:
+        _warn_of_assumed_size(assumed, warn)  # it may be why
+        raise
+    sizes = {recording.sequence.projector_size for recording in imports.recordings}
+    if assumed in sizes:  # a layout that states the size itself does not use it
+        _warn_of_assumed_size(assumed, warn)
     if channel is not None:
         imports = replace(imports, recordings=[replace(recording, channel=channel) for recording in imports.recordings])
     return imports
@@ -232,6 +236,14 @@ def _save_captures(
                 warn(f"{name}: {sentence}")
     progress(1.0, "imported")
     return names
+
+
+def _warn_of_assumed_size(size: tuple[int, int] | None, warn: Warn) -> None:
+    """Warn that the projector's size was taken from the session, if it was."""
+    if size is not None:
+        warn(
+            f"the projector is assumed to have {size[0]}x{size[1]} px, as in the session: --projector for another size"
+        )
 
 
 def _known_projector_size(session: SessionLike) -> tuple[int, int] | None:

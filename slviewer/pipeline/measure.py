@@ -7,7 +7,7 @@ from typing import Literal, NoReturn
 from slviewer.errors import UsageError
 from slviewer.inspection.regions import Region
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
-from slviewer.pipeline.measured_surface import Place, load_surface
+from slviewer.pipeline.measured_surface import MERGED, Place, load_surface
 from slviewer.pipeline.measurements import (
     add_distance,
     add_fit,
@@ -21,9 +21,10 @@ from slviewer.pipeline.measurements import (
     relabel_measurement,
     undo_delete,
 )
-from slviewer.pipeline.models import ModelName
+from slviewer.pipeline.models import ModelName, available_models
 from slviewer.pipeline.open_session import SessionLike, opened
 from slviewer.session.measurements import Measurement
+from slviewer.session.store import Session
 
 What = Literal["point", "distance", "section", "plane", "sphere", "cylinder"]
 
@@ -51,7 +52,8 @@ def measure(
         what: point, distance and section take --at; plane, sphere and cylinder take --ball or --box.
         at: Pixel u v (column, row of the camera's picture) of the point, or u v u v of both ends of the distance or
             section; for a merge the points' numbers in its file, from 0.
-        ball: The region to fit to: centre x y z and radius, mm, in the camera's frame (x right, y down, z away).
+        ball: The region to fit to: centre x y z and radius, mm, in the camera's frame (x right, y down, z away). All
+            points within this radius of the centre: for a sphere, a little more than its own radius.
         box: The region to fit to: two corners x y z x y z, mm, in the camera's frame.
         name: What to call it.
         model: Which calibration to use; by default the best one available.
@@ -71,14 +73,32 @@ def measure(
         )
         if fitted:
             region = Region.ball(ball[:3], ball[3]) if ball else Region.box(box[:3], box[3:])
-            return add_fit(store, on, what, region, name)  # type: ignore[arg-type]
+            measured = add_fit(store, on, what, region, name)  # type: ignore[arg-type]
+            _warn_of_partial_uncertainty(store, measured, warn)
+            return measured
         numbers = 2 if on.organised else 1
         if len(at) != ends * numbers:
             _raise_place_error(what, ends, "pixel u v" if on.organised else "index")
         places: list[Place] = [(at[i], at[i + 1]) if on.organised else at[i] for i in range(0, len(at), numbers)]
         if what == "point":
             return add_point(store, on, places[0], name)
-        return (add_distance if what == "distance" else add_section)(store, on, places[0], places[1], name)
+        measured = (add_distance if what == "distance" else add_section)(store, on, places[0], places[1], name)
+        _warn_of_partial_uncertainty(store, measured, warn)
+        return measured
+
+
+def _warn_of_partial_uncertainty(store: Session, measured: Measurement, warn: Warn) -> None:
+    """Warn where the uncertainty of a measurement lacks the calibration's part, with the remedy."""
+    if all(quantity.whole for quantity in measured.quantities):
+        return
+    if measured.source.startswith(MERGED):
+        remedy = "measure on one of its scans with the splined model (--model splined)"
+    elif "splined" in available_models(store):
+        remedy = "measure with the splined model (--model splined)"
+    else:
+        remedy = "calibrate with the splined model, which takes eight poses or more, and measure with it"
+    cause = "a merge" if measured.source.startswith(MERGED) else f"the model {measured.model}"
+    warn(f"{measured.name}: U is too small, as {cause} does not know the calibration's part: {remedy}")
 
 
 def _raise_place_error(what: What, ends: int, which: str) -> NoReturn:

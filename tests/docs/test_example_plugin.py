@@ -78,7 +78,7 @@ def test_its_importer_and_exporter_work_in_commands(installed: Path, tmp_path: P
         cv2.imwrite(str(file), cv2.convertScaleAbs(render(sequence, k), alpha=0.7, beta=20))
     command = ["-m", "slviewer.cli", "import"]
     printed = run([*command, "auto", "part", "session", "--projector", "720x720"], installed, tmp_path)
-    assert "layout axisfolders" in printed and "1 capture imported: part" in printed
+    assert "layout axisfolders" in printed and "1 capture imported as a target pose: part" in printed
     printed = run([*command, "axisfolders", "part", "other", "--projector", "720x720"], installed, tmp_path)
     assert "1 capture imported" in printed
     run(["-m", "slviewer.cli", "decode", "session", "part", "--out", "maps"], installed, tmp_path)

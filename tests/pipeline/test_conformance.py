@@ -1,6 +1,7 @@
 """The checks for plugins accept the drivers that come with slviewer, and name what a bad one does."""
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -11,8 +12,9 @@ from slviewer.devices.opening import Openable
 from slviewer.devices.protocols import CameraSettings, check_frame
 from slviewer.devices.simulated import SimulatedTurntable, simulated_rig
 from slviewer.devices.world import SimulatedWorld
-from slviewer.fringe.presets import phase_steps
-from slviewer.fringe.sequence import PatternSequence
+from slviewer.fringe.patterns import render
+from slviewer.fringe.presets import gray_bits, phase_steps
+from slviewer.fringe.sequence import Frame, PatternSequence
 from slviewer.pipeline.conformance import (
     check_board,
     check_camera,
@@ -21,7 +23,13 @@ from slviewer.pipeline.conformance import (
     check_projector,
     check_turntable,
 )
-from slviewer.session.importers.imported import ImportableRecording, define_layout, has_images, match_images
+from slviewer.session.importers.imported import (
+    ImportableRecording,
+    check_complete,
+    define_layout,
+    has_images,
+    match_images,
+)
 from slviewer.session.importers.layouts import detect_layout, layouts
 from slviewer.session.mesh_files import Exporter
 from slviewer.simulation.rig import letter
@@ -151,6 +159,44 @@ def capture(tmp_path: Path) -> Path:
 
 def test_an_importer_that_reads_incomplete_captures_is_named(capture):
     assert any("as if it were complete" in fault for fault in check_importer(layout(), capture))
+
+
+SHOWN = PatternSequence((96, 72), (Frame("white"), Frame("black"), *phase_steps("x", 4, 12), *gray_bits("x", 3)))
+
+
+@pytest.fixture
+def rendered(tmp_path: Path) -> Path:
+    """A capture of the sequence SHOWN by a camera with the projector's own pixels, 16 bits with noise."""
+    (folder := tmp_path / "rendered").mkdir()
+    rng = np.random.default_rng(0)
+    for k in range(len(SHOWN.frames)):
+        image = 8 * (render(SHOWN, k) * 0.7 + 20.0) + rng.normal(0, 4, SHOWN.projector_size[::-1])
+        cv2.imwrite(str(folder / f"shot{k:02d}.png"), image.round().astype(np.uint16))
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("wrong", "named"),
+    [
+        ({}, ""),
+        ({"phase_sign": -1}, "phase_sign"),
+        ({"phase_offset_rad": 1.0}, "phase_offset_rad"),
+        ({"gray_origin_px": 3.0}, "gray_origin_px"),
+        ({"full_scale": 1023}, "1023"),
+        ({"frames": (SHOWN.frames[1], SHOWN.frames[0], *SHOWN.frames[2:])}, "shot01"),
+        ({"frames": (*SHOWN.frames[:6], *SHOWN.frames[:5:-1])}, "bit"),
+        ({"frames": (*SHOWN.frames[:2], *phase_steps("x", 4, 6), *SHOWN.frames[6:])}, "period"),
+    ],
+    ids=["right", "sign", "offset", "origin", "full scale", "white", "bits", "period"],
+)
+def test_an_importer_that_misdescribes_frames_is_named_as_an_import_does(rendered, wrong, named):
+    def describe(folder, name, projector):
+        images, _ = match_images(folder, PATTERN)
+        check_complete(images, "shot", len(SHOWN.frames))
+        return ImportableRecording(name, replace(SHOWN, **wrong), tuple(images.values()), folder), []
+
+    faults = check_importer(layout(describe), rendered)
+    assert len(faults) == bool(wrong) and all(named in fault for fault in faults), faults
 
 
 def fails(*_):

@@ -1,5 +1,6 @@
 """Folders that other tools made, through the command line: what is kept, what is skipped, and what is said of it."""
 
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -12,6 +13,14 @@ from slviewer.fringe.patterns import render
 from slviewer.fringe.presets import gray, phase_steps
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.pipeline.capture_phases import decode_capture
+from slviewer.pipeline.import_captures import find_captures
+from slviewer.session.importers.imported import (
+    FolderLayout,
+    ImportableRecording,
+    define_layout,
+    has_images,
+    match_images,
+)
 from slviewer.session.store import Session
 
 Run = Callable[..., tuple[int, str, str]]
@@ -45,7 +54,7 @@ def test_an_import_that_is_repeated_adds_what_is_missing(run: Run, tmp_path: Pat
     chunk = session / "captures/capture_1/frames.zarr/c.2.0.0"
     sound = chunk.read_bytes()
     status, out, err = run("import", "procam-calibration", tmp_path / "source", session, *options)
-    assert status == 0 and "3 captures imported" in out and "not imported again: capture_1\n" in err
+    assert status == 0 and "3 captures imported as target poses" in out and "not imported again: capture_1\n" in err
     assert not (session / "trash").exists()
     chunk.write_bytes(sound[:100] + bytes(len(sound) - 100))  # the remedy for damage is to import again
     status, _, err = run("import", "procam-calibration", tmp_path / "source", session, *options)
@@ -73,7 +82,7 @@ def faulty(tmp_path: Path) -> Path:
 def test_readable_captures_are_imported_and_the_others_named(faulty: Path, run: Run, tmp_path: Path) -> None:
     session = tmp_path / "session"
     status, out, err = run("import", "procam-calibration", faulty, session, "--projector", "120x90")
-    assert status == 0 and "2 captures imported: capture_0, capture_4" in out
+    assert status == 0 and "2 captures imported as target poses: capture_0, capture_4" in out
     warnings = [line for line in err.splitlines() if line.startswith("warning: not imported")]
     assert len(warnings) == 3
     for name, fact in (("capture_1", "graycode_03.png"), ("capture_2", "graycode_07"), ("capture_3", "modulation")):
@@ -153,10 +162,32 @@ def test_exposures_of_a_toml_become_those_of_the_session(run: Run, tmp_path: Pat
 
 def test_a_projector_size_that_is_not_stated_is_said(run: Run, tmp_path: Path) -> None:
     source, session = write_colour(tmp_path / "source"), tmp_path / "session"
-    status, _, err = run("import", "auto", source, session, "--role", "scan")
+    status, out, err = run("import", "auto", source, session, "--role", "scan")
+    assert "1 capture imported as a scan: scan" in out
     assert status == 0 and "projector" in err and "not stated" in err
     status, out, _ = run("inspect", session)
     assert status == 0 and "unknown size" in out
+
+
+def test_the_size_of_the_session_is_named_only_where_it_was_used(run: Run, tmp_path: Path, monkeypatch) -> None:
+    write_captures(tmp_path / "source", 1)
+    session, warnings = tmp_path / "session", []
+    assert run("import", "procam-calibration", tmp_path / "source", session, "--projector", "120x90")[0] == 0
+    images = re.compile(r"graycode_(\d+)")
+
+    def make_layout(stated: tuple[int, int] | None) -> FolderLayout:
+        def describe(folder: Path, name: str, projector: tuple[int, int]) -> tuple[ImportableRecording, list[str]]:
+            files = match_images(folder, images)[0]
+            return ImportableRecording(name, gray(stated or projector), tuple(files.values()), folder), []
+
+        return define_layout("own", "images", describe, lambda folder: has_images(folder, images))
+
+    for stated, expected in (((160, 100), 0), (None, 1)):
+        monkeypatch.setattr(
+            "slviewer.pipeline.import_captures.layouts", lambda stated=stated: {"own": make_layout(stated)}
+        )
+        find_captures(tmp_path / "source", "own", session=session, warn=warnings.append)
+        assert len(warnings) == expected and all("120x90" in warning for warning in warnings)
 
 
 @pytest.mark.parametrize(("gain", "word"), [(0.2, "exposure"), (1.9, "saturated"), (1.0, "")])

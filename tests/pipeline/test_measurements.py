@@ -224,6 +224,8 @@ def test_the_terminal_measures_relates_names_and_writes_a_table(folder, balls, r
         top = centre - [0, 0, RADIUS]
         status, said, wrong = run("measure", folder, "balls", "sphere", "--ball", *top, 14, "--name", name)
         assert status == 0 and f"{name} (sphere on balls): radius 2" in said, wrong
+        warnings = [line for line in wrong.splitlines() if "calibration's part" in line]
+        assert len(warnings) == 1 and "stereo" in warnings[0] and "splined" in warnings[0], wrong
     status, said, _ = run("measure", folder, "balls", "distance", "--at", u, v, x, y)
     assert status == 0 and said.startswith("m3 ") and "distance 8" in said
     status, said, _ = run(

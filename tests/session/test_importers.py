@@ -11,6 +11,7 @@ from slviewer.fringe import presets
 from slviewer.fringe.sequence import Frame
 from slviewer.session.importers import frames as frames_layout
 from slviewer.session.importers import p18, procam_calibration
+from slviewer.session.importers.imported import check_complete
 
 
 def image(seed: int, dtype=np.uint8) -> np.ndarray:
@@ -168,6 +169,25 @@ def test_procam_calibration_counts(tmp_path):
         procam_calibration.LAYOUT.read(tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("form", "first", "missing", "named"),
+    [
+        ("{:04d}", 1, 3, "shot_0003:"),
+        ("{:04d}", 1, 6, "shot_0006:"),
+        ("{}", 0, 2, "shot_2:"),
+        ("{:02d}", 0, 0, "shot_00:"),
+    ],
+)
+def test_missing_images_are_named_as_the_others(form, first, missing, named):
+    numbers = [number for number in range(first, first + 6)]
+    images = {(n,): Path(f"shot_{form.format(n)}.png") for n in numbers}
+    check_complete(images, "shot_", 6, first=first)
+    check_complete(images, "shot_", first=first)
+    del images[(missing,)]
+    with pytest.raises(InputError, match=f"lacks {named}"):
+        check_complete(images, "shot_", 6, first=first)
+
+
 def test_procam_calibration_of_a_real_rig(real_data):
     found = procam_calibration.LAYOUT.read(real_data / "kamino_procam_jpg90")
     assert len(found) == 5
@@ -240,7 +260,7 @@ def test_frames_are_what_the_toml_says(tmp_path):
 @pytest.mark.parametrize(
     ("edit", "message"),
     [
-        (lambda t: t.replace("96x64", "96"), "projector size"),
+        (lambda t: t.replace("96x64", "96"), "'96' is no size"),
         (lambda t: 'channel = "grey"\n' + t, "channel is 'grey'"),
         (lambda t: 'order = "time"\n' + t, "order is 'time'"),
         (lambda t: 'order = "name"\n' + t, r"\[\[frame\]\] 1 names files, and order"),

@@ -140,11 +140,18 @@ def match_images(folder: Path, pattern: re.Pattern[str]) -> tuple[dict[tuple[int
     return dict(sorted(images.items())), others
 
 
-def check_complete(images: Mapping[tuple[int, ...], Path], stem: str, count: int = 0) -> None:
-    """Raise InputError where images numbered 0, 1, 2, ... have gaps, or are fewer than ``count``."""
-    count = count or max(images)[0] + 1
-    if missing := [number for number in range(count) if (number,) not in images]:
-        raise InputError(f"it lacks {stem}{listed([f'{n:02d}' for n in missing])}: copy or record them again")
+def check_complete(images: Mapping[tuple[int, ...], Path], stem: str, count: int = 0, first: int = 0) -> None:
+    """Raise InputError where images numbered ``first``, ``first`` + 1, ... have gaps, or are fewer than ``count``.
+
+    Numbers of missing images are named with as many digits as those that are there.
+    """
+    if not images and not count:
+        raise InputError(f"it holds no images {stem}{first:02d} and so on: copy or record them again")
+    end = first + count if count else max(images)[0] + 1
+    if missing := [number for number in range(first, end) if (number,) not in images]:
+        written = [run for (n,), file in images.items() for run in re.findall(r"\d+", file.stem) if int(run) == n]
+        digits = min(map(len, written), default=2)
+        raise InputError(f"it lacks {stem}{listed([f'{n:0{digits}d}' for n in missing])}: copy or record them again")
 
 
 def has_images(folder: Path, pattern: re.Pattern[str]) -> bool:

@@ -19,6 +19,7 @@ from slviewer.plugins import (
     Board,
     CameraSettings,
     DeviceError,
+    PatternSequence,
     TurntableError,
     check_board,
     check_camera,
@@ -26,6 +27,8 @@ from slviewer.plugins import (
     check_importer,
     check_projector,
     check_turntable,
+    phase_steps,
+    render,
 )
 from slviewer.target.detect import detect
 
@@ -130,12 +133,24 @@ def test_the_board_is_detected_where_it_is() -> None:
 
 
 def test_the_importer_reads_whole_captures_alone(tmp_path: Path) -> None:
-    rng = np.random.default_rng(0)
-    for axis in "xy":
-        (tmp_path / "part" / axis).mkdir(parents=True)
-        for k in range(12):
-            cv2.imwrite(str(tmp_path / "part" / axis / f"{k}.png"), rng.integers(0, 255, (48, 64)).astype(np.uint8))
-    assert check_importer(LAYOUT, tmp_path / "part", projector=(720, 720)) == []
+    size = (144, 108)
+    frames = [
+        frame
+        for axis, extent in zip("xy", size, strict=True)
+        for n in (1, 6, 36)
+        for frame in phase_steps(axis, 4, extent / n)
+    ]
+    shown = PatternSequence(size, tuple(frames))
+    for k in range(len(frames)):  # what a camera with the projector's own pixels records
+        file = tmp_path / "part" / "xy"[k // 12] / f"{k % 12}.png"
+        file.parent.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(file), cv2.convertScaleAbs(render(shown, k), alpha=0.7, beta=20))
+    assert check_importer(LAYOUT, tmp_path / "part", projector=size) == []
+    x = tmp_path / "part" / "x"  # frames out of order are named
+    for old, new in (("4", "other"), ("5", "4"), ("other", "5")):
+        (x / f"{old}.png").rename(x / f"{new}.png")
+    (fault,) = check_importer(LAYOUT, tmp_path / "part", projector=size)
+    assert "x/4.png" in fault and "x/5.png" in fault
 
 
 def test_the_exporter_writes_its_format() -> None:
