@@ -46,7 +46,7 @@ def test_a_sound_rig(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     said = capsys.readouterr().out
     assert "good     screen: " in said and "settle_ms = " in said and "bad" not in said
     written = json.loads(found.read_text())
-    assert written["verdict"] == "good" and 0.1 < written["seconds"] < 30
+    assert written["verdict"] == "good" and 0.1 < written["seconds"] < 300
     assert {check["name"] for check in written["checks"]} >= {"screen", "latency", "order", "flicker"}
 
 

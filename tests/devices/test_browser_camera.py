@@ -105,7 +105,7 @@ def fails(words: str, do: Callable[[], object]) -> None:
     begun = time.monotonic()
     with pytest.raises(DeviceError, match=words):
         do()
-    assert time.monotonic() - begun < 1.0
+    assert time.monotonic() - begun < 10
 
 
 def test_a_picture_that_is_none_ends_the_grab() -> None:

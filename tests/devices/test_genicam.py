@@ -209,7 +209,7 @@ def test_a_camera_that_sends_nothing_ends_this_grab_only(camera):
     began = time.monotonic()
     with pytest.raises(DeviceError, match=r"0\.2 s"):
         grabbed(camera)
-    assert 0.2 <= time.monotonic() - began < 1
+    assert 0.2 <= time.monotonic() - began < 10
     column(grabbed(camera))
 
 

@@ -390,7 +390,7 @@ def test_a_taken_port_is_an_error_at_once(server):
     start = time.monotonic()
     with pytest.raises(SlviewerError, match="--port"):
         serve(Serving(port=server.port))
-    assert time.monotonic() - start < 2
+    assert time.monotonic() - start < 10
 
 
 @pytest.mark.parametrize("host", ["203.0.113.7", "no.such.host.invalid", "", "::1::2", "127.0.0.1:8080"])
@@ -398,15 +398,15 @@ def test_an_unusable_address_is_an_error_at_once(host):
     start = time.monotonic()
     with pytest.raises(SlviewerError):
         serve(Serving(host, 0))
-    assert time.monotonic() - start < 2
+    assert time.monotonic() - start < 10
 
 
 def test_a_slow_name_server_is_not_waited_for(monkeypatch):
-    monkeypatch.setattr(socket, "getaddrinfo", lambda *_, **__: time.sleep(3) or [])
+    monkeypatch.setattr(socket, "getaddrinfo", lambda *_, **__: time.sleep(15) or [])
     start = time.monotonic()
     with pytest.raises(SlviewerError, match=r"127\.0\.0\.1"):
         serve(Serving("slow.example", 0))
-    assert time.monotonic() - start < 2
+    assert time.monotonic() - start < 10
 
 
 def test_it_serves_this_machine_alone_unless_told(server):

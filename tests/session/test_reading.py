@@ -39,7 +39,7 @@ def test_only_regular_files_of_limited_size_are_read(tmp_path, kind):
         read_toml(path)
     with pytest.raises(DamagedError):
         read_json(path)
-    assert time.monotonic() - started < 5
+    assert time.monotonic() - started < 60
 
 
 @pytest.mark.parametrize(
@@ -96,7 +96,7 @@ def test_inputs_that_form_a_circle_or_many_paths_are_examined_once(session, monk
         session.save_result(name, {"inputs": session.input_hashes(f"{name}b") | inputs}, {})
     started = time.monotonic()
     assert session.state_of(names[-1]) in ("fresh", "stale")
-    assert time.monotonic() - started < 5
+    assert time.monotonic() - started < 60
     path = session.folder / "results/made/n0/meta.json"
     meta = json.loads(path.read_text())
     path.write_text(json.dumps({**meta, "inputs": {"made/n0b": "x", "made/n29": "y"}}))
