@@ -49,6 +49,11 @@ def compute_values(data: dict[str, Any]) -> dict[str, float]:
     for model in ("stereo", "pixelwise"):
         values[f"radius {model}"] = _mean(each["models"][model]["radius_mm"] for each in data["spheres"].values())
         values[f"spacing {model}"] = data["spacing_rms_mm"][model]
+    for place, plane in (("front", "plane_01"), ("behind", "plane_07")):
+        models = data["planes"][plane]["models"]
+        values[f"{place} ratio"] = models["stereo"]["rms_mm"] / models["pixelwise"]["rms_mm"]
+    for name, pair in data["merge"]["pairs"].items():
+        values[f"merge {name[-2:]}"] = pair["point_to_point_rms_mm"]
     return values
 
 
@@ -105,6 +110,19 @@ def compute_edges(data: dict[str, Any]) -> dict[str, float]:
     }
 
 
+def compute_surfaces(data: dict[str, Any]) -> dict[str, float]:
+    """Return the numbers of the pages by name, from the JSON of ``prove --only surfaces``."""
+    values = {}
+    for surface, sequences in data["surfaces"].items():
+        for sequence, errors in sequences.items():
+            values[f"surfaces {surface}; {sequence}"] = errors["rms_mm"]
+        p18 = sequences["p18"]
+        values[f"surfaces {surface}; ratio"] = p18["rms_mm"] / sequences["micro"]["rms_mm"]
+        for name, share in (("masked", "gross_caught"), ("caught", "caught"), ("lost", "lost")):
+            values[f"surfaces {surface}; {name}"] = 100 * p18[share]
+    return values
+
+
 def _find_largest(checks: Iterable[dict[str, Any]]) -> dict[str, float]:
     """Return {figure: its largest value} of all rigs."""
     largest: dict[str, float] = {}
@@ -118,6 +136,7 @@ SOURCES: dict[str, tuple[str, Callable[[dict[str, Any]], dict[str, float]]]] = {
     "accuracy": ("slviewer prove --quick --only accuracy", compute_accuracy),
     "registration": ("slviewer prove --quick --only registration", compute_registration),
     "edges": ("slviewer prove --only edges", compute_edges),
+    "surfaces": ("slviewer prove --only surfaces", compute_surfaces),
     "": ("slviewer reproduce --quick", compute_values),
 }
 """{first word of a number's name: the command, some minutes, and the numbers that follow from it}."""
