@@ -45,7 +45,7 @@ def app(operator: Operator) -> Iterator[App]:
 def opened(browser: Browser, app: App) -> Iterator[Opened]:
     """The operator's page, ready."""
     page = browser.new_page(viewport=SIZE)
-    page.set_default_timeout(20_000)
+    page.set_default_timeout(60_000)
     found = Opened(page)
     page.goto(app.server.link())
     button(page, "1. Rig").wait_for()

@@ -28,7 +28,7 @@ from slviewer.validation.bench_live import true_calibration
 from slviewer.wizard.operator import Operator
 from slviewer.wizard.result_views import scan_cloud, whole_cloud
 
-PATIENCE_S = 40.0
+PATIENCE_S = 150.0
 
 
 def capture_scans(folder: Path, world: SimulatedWorld, angles_deg: dict[str, float], patterns: str = "gray") -> None:
@@ -51,7 +51,7 @@ def wizard(tmp_path: Path, browser: Browser) -> Iterator[tuple[Opened, App, Oper
         operator.wait_until_idle()
         app = App(operator, Serving(port=0))
         page = browser.new_page(viewport=SIZE)
-        page.set_default_timeout(20_000)
+        page.set_default_timeout(60_000)
         opened = Opened(page)
         page.goto(app.server.link())
         click(page, "6. Scan")
@@ -231,7 +231,7 @@ def test_six_clicks_make_a_clean_textured_mesh_of_a_part_on_a_table(tmp_path: Pa
     with Operator(folder) as operator:
         app = App(operator, Serving(port=0))
         page = browser.new_page(viewport=SIZE)
-        page.set_default_timeout(20_000)
+        page.set_default_timeout(60_000)
         opened = Opened(page)
         page.goto(app.server.link())
         click(page, "6. Scan")
@@ -283,7 +283,7 @@ def test_a_plan_is_made_uploaded_and_run_on_two_scans(tmp_path: Path, browser: B
         top = world.pose.t - [0.0, 0.0, 98.0]
         app = App(operator, Serving(port=0))
         page = browser.new_page(viewport=SIZE)
-        page.set_default_timeout(20_000)
+        page.set_default_timeout(60_000)
         opened = Opened(page)
         page.goto(app.server.link())
         click(page, "8. Measure")

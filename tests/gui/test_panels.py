@@ -53,7 +53,7 @@ def measured(
     with Operator(folder) as engine:
         wizard = App(engine, Serving(port=0))
         page = browser.new_page(viewport=SIZE)
-        page.set_default_timeout(20_000)
+        page.set_default_timeout(60_000)
         found = Opened(page)
         page.goto(wizard.server.link())
         button(page, "1. Rig").wait_for()

@@ -39,7 +39,7 @@ DEPTHS_MM = (560, 600, 640)
 def visit(browser: Browser, url: str) -> Opened:
     """A browser of its own on this address, ready."""
     page = browser.new_context(viewport=SIZE).new_page()  # type: ignore[arg-type]
-    page.set_default_timeout(20_000)
+    page.set_default_timeout(60_000)
     found = Opened(page)
     page.goto(url)
     button(page, "1. Rig").wait_for()

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from playwright.sync_api import ConsoleMessage, Locator, Page, TimeoutError, expect
 
 SIZE = {"width": 1280, "height": 800}
-PATIENCE_MS = 60_000
+PATIENCE_MS = 120_000
 """For what is computed, on a machine that is busy with other things."""
 SMALL_CANVAS = """
 for (const side of ["width", "height"]) {
