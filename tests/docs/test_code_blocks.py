@@ -148,8 +148,11 @@ def test_the_python_of_a_page_runs(page: Path, tmp_path: Path, monkeypatch) -> N
     monkeypatch.chdir(tmp_path)
     capture = tmp_path / "captures" / "part_1"  # of the layout that docs/howto/plugins.md describes
     capture.mkdir(parents=True)
+    columns, noise = 480 + np.arange(320), np.random.default_rng(0)
     for k in range(12):
-        cv2.imwrite(str(capture / f"shot{k:02d}.png"), np.full((48, 64), 20 * k, np.uint8))
+        phase = 2 * np.pi * (columns / (1280, 180, 30)[k // 4] + k % 4 / 4)
+        frame = 120 + 80 * np.cos(phase) + noise.normal(0, 1, (240, 320))
+        cv2.imwrite(str(capture / f"shot{k:02d}.png"), frame.astype(np.uint8))
     names: dict[str, object] = {"__name__": "page"}
     for block in blocks(page, "python"):
         if not block.reason:
