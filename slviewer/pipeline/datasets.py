@@ -56,9 +56,9 @@ def fetch(name: str = "sample", folder: Path | str | None = None, progress: Prog
     if name not in known:
         also = "; letter is attached to releases, and this is no release: make it by assets/make_sample_data.py letter"
         raise InputError(f"no data set is called {name!r}: use {' or '.join(known)}{also * (name == 'letter')}")
-    dataset, cache = known[name], _cache_folder()
+    dataset = known[name]
     if folder is None:
-        target = cache / f"{name}-{dataset.sha256[:12]}"
+        target = _cache_folder() / f"{name}-{dataset.sha256[:12]}"
         if target.is_dir():  # renamed to its place when it was complete
             return target
     else:
@@ -66,7 +66,7 @@ def fetch(name: str = "sample", folder: Path | str | None = None, progress: Prog
         if target.exists():
             raise InputError(f"{target} exists: give the name of a new folder")
     if dataset.url:
-        source = _download(name, dataset, cache, part(progress, 0.0, 0.8))
+        source = _download(name, dataset, part(progress, 0.0, 0.8))
     else:
         source = asset(dataset.archive)
         if hashlib.sha256(source.read_bytes()).hexdigest() != dataset.sha256:
@@ -82,7 +82,7 @@ def fetch(name: str = "sample", folder: Path | str | None = None, progress: Prog
     return target
 
 
-def _download(name: str, dataset: Dataset, cache: Path, progress: Progress) -> Path:
+def _download(name: str, dataset: Dataset, progress: Progress) -> Path:
     """Return the archive of a data set in the cache, downloaded if it is not there or not what it should be."""
     import pooch
     import requests
@@ -94,13 +94,13 @@ def _download(name: str, dataset: Dataset, cache: Path, progress: Progress) -> P
             dataset.url,
             f"sha256:{dataset.sha256}",
             fname=f"{name}-{dataset.sha256[:12]}.zip",
-            path=cache,
+            path=_cache_folder(),
             downloader=pooch.HTTPDownloader(progressbar=bar, timeout=_TIMEOUT_S),
         )
     except requests.RequestException as error:
         raise InputError(
             f"{dataset.url} was not downloaded ({type(error).__name__}): check the network, or download it elsewhere "
-            f"and unpack it; the data set 'sample' needs no network"
+            "and unpack it; the data set 'sample' needs no network"
         ) from error
     except ValueError as error:  # pooch: the hash differs
         raise InputError(f"what {dataset.url} returned is not the data set {name!r}: its hash differs") from error
@@ -129,7 +129,8 @@ class _DownloadBar:
 
 def _cache_folder() -> Path:
     """Return the user's folder for data sets."""
+    if given := os.environ.get(CACHE):
+        return Path(given)
     import pooch
 
-    given = os.environ.get(CACHE)
-    return Path(given) if given else Path(pooch.os_cache("slviewer")) / "datasets"
+    return Path(pooch.os_cache("slviewer")) / "datasets"

@@ -91,13 +91,13 @@ def _warn_of_partial_uncertainty(store: Session, measured: Measurement, warn: Wa
     """Warn where the uncertainty of a measurement lacks the calibration's part, with the remedy."""
     if all(quantity.whole for quantity in measured.quantities):
         return
+    cause = f"the model {measured.model}"
     if measured.source.startswith(MERGED):
-        remedy = "measure on one of its scans with the splined model (--model splined)"
+        cause, remedy = "a merge", "measure on one of its scans with the splined model (--model splined)"
     elif "splined" in available_models(store):
         remedy = "measure with the splined model (--model splined)"
     else:
         remedy = "calibrate with the splined model, which takes eight poses or more, and measure with it"
-    cause = "a merge" if measured.source.startswith(MERGED) else f"the model {measured.model}"
     warn(f"{measured.name}: U is too small, as {cause} does not know the calibration's part: {remedy}")
 
 
