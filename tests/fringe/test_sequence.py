@@ -106,7 +106,7 @@ def test_a_frame_that_cannot_be_is_refused(data):
 def test_sizes():
     assert parse_size("912x1140") == parse_size([912, 1140]) == (912, 1140)
     for bad in ("912", "912x", "0x4", "axb", None):
-        with pytest.raises(InputError, match="projector"):
+        with pytest.raises(InputError, match="width and height in px"):
             parse_size(bad)
 
 
@@ -162,7 +162,7 @@ def test_a_sequence_without_a_projector_size():
         ({"phase_sign": {"x": 1, "y": 0}}, "phase_sign is 0"),
         ({"phase_sign": {"x": 1, "z": 1}}, "unknown entry 'z'"),
         ({"phase_offset": "quarter"}, "phase_offset must be a number"),
-        ({"phase_offset": float("nan")}, "phase_offset is nan"),
+        ({"phase_offset": float("nan")}, "is nan rad"),
         ({"gray_cell_px": 0}, "Gray cell of 0"),
         ({"gray_cell_px": {"x": -2}}, "axis x: a Gray cell of -2"),
         ({"gray_origin": []}, "gray_origin must be a number"),
