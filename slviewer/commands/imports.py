@@ -41,15 +41,13 @@ DESCRIBED = (
 
 def run_import(layout: str, import_captures: Callable[..., Any], arguments: dict[str, Any]) -> None:
     """Import folders of a layout, and print the captures' role and names."""
-    if layout == "detect":
-        from slviewer.pipeline.import_captures import detect_layout
+    from slviewer.pipeline.import_captures import describe_import, detect_layout
 
+    if layout == "detect":
         layout = detect_layout(arguments["source"])
         terminal.print_result(f"layout {layout}")
     names = call(import_captures, layout=layout, **arguments)
-    one, several = ("a target pose", "target poses") if arguments["role"] == "calibration" else ("a scan", "scans")
-    count = f"1 capture imported as {one}" if len(names) == 1 else f"{len(names)} captures imported as {several}"
-    terminal.print_result(f"{count}: {', '.join(names)}")
+    terminal.print_result(describe_import(names, arguments["role"]))
 
 
 def run_frames(import_captures: Callable[..., Any], arguments: dict[str, Any]) -> None:

@@ -5,7 +5,7 @@ its reason; with `strict`, one fault refuses the folder. Those that the session 
 skipped: an import that was interrupted continues when it is repeated.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -236,6 +236,13 @@ def _save_captures(
                 warn(f"{name}: {sentence}")
     progress(1.0, "imported")
     return names
+
+
+def describe_import(names: Sequence[str], role: Role) -> str:
+    """Return what was imported, as the operator reads it."""
+    one, several = ("a target pose", "target poses") if role == "calibration" else ("a scan", "scans")
+    count = f"1 capture imported as {one}" if len(names) == 1 else f"{len(names)} captures imported as {several}"
+    return f"{count}: {', '.join(names)}"
 
 
 def _warn_of_assumed_size(size: tuple[int, int] | None, warn: Warn) -> None:

@@ -91,8 +91,8 @@ def _warn_of_partial_uncertainty(store: Session, measured: Measurement, warn: Wa
     """Warn where the uncertainty of a measurement lacks the calibration's part, with the remedy."""
     if all(quantity.whole for quantity in measured.quantities):
         return
-    cause = f"the model {measured.model}"
-    if measured.source.startswith(MERGED):
+    cause = "the model " + " or ".join(each for each in measured.model.split(", ") if each != "splined")
+    if any(source.startswith(MERGED) for source in measured.source.split(", ")):
         cause, remedy = "a merge", "measure on one of its scans with the splined model (--model splined)"
     elif "splined" in available_models(store):
         remedy = "measure with the splined model (--model splined)"
@@ -118,6 +118,7 @@ def edit_measurements(
     delete: Sequence[str] = (),
     bring_back: bool = False,
     csv: Path | None = None,
+    warn: Warn = ignore_warnings,
 ) -> str:
     """List the measurements that a session holds.
 
@@ -133,7 +134,7 @@ def edit_measurements(
         return _list_measurements(session, csv)
     with opened(session, write=True) as store:
         if relate:
-            add_relation(store, *relate)
+            _warn_of_partial_uncertainty(store, add_relation(store, *relate), warn)
         if name:
             relabel_measurement(store, *name)
         for each in delete:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from slviewer.errors import InputError
-from slviewer.pipeline.import_captures import import_captures
+from slviewer.pipeline.import_captures import Role, describe_import, import_captures
 from slviewer.session import atomic
 from slviewer.session.importers.archive import unpack, unpacked_size
 from slviewer.session.names import new_name
@@ -24,7 +24,9 @@ class ImportRequests(RequestHandler):
     """Requests that import captures on the worker, as the command line does."""
 
     @request(IMPORTING)
-    def import_folder(self, folder: Path | str, layout: str = "detect", **options: Any) -> None:
+    def import_folder(
+        self, folder: Path | str, layout: str = "detect", role: Role = "calibration", **options: Any
+    ) -> None:
         """Import the captures in a folder of this computer; `options` as `import_captures` takes them."""
         path = str(folder).strip()
         if not path:
@@ -35,18 +37,21 @@ class ImportRequests(RequestHandler):
             """Import the folder's captures; returns their names."""
             session = store.guarded(report.saving)
             source = expand_user(path)
-            return import_captures(source, session, layout, progress=report, warn=self._warner("frames"), **options)
+            warn = self._warner("frames")
+            return import_captures(source, session, layout, role=role, progress=report, warn=warn, **options)
 
-        self._submit_import(work)
+        self._submit_import(work, role)
 
     @request(IMPORTING)
-    def import_zip(self, name: str, content: bytes, layout: str = "detect", **options: Any) -> None:
+    def import_zip(
+        self, name: str, content: bytes, layout: str = "detect", role: Role = "calibration", **options: Any
+    ) -> None:
         """Import the captures in a zip that was uploaded as `name`; images outside of folders become one capture of
         that name."""
-        self._submit_import(partial(self._read_zip, name, content, layout, options))
+        self._submit_import(partial(self._read_zip, name, content, layout, role, options), role)
 
-    def _submit_import(self, work: Callable[[Reporter], list[str]]) -> None:
-        """Queue an import; `work(report)` returns the names of the captures, which are then processed."""
+    def _submit_import(self, work: Callable[[Reporter], list[str]], role: Role) -> None:
+        """Queue an import as `role`; `work(report)` returns the names of the captures, which are then processed."""
 
         def import_and_process(report: Reporter) -> list[str]:
             """Import, and queue the processing of the new captures; returns their names."""
@@ -54,13 +59,11 @@ class ImportRequests(RequestHandler):
             self._engine.queue_processing()
             return names
 
-        def describe(names: list[str]) -> str:
-            """Return a notice with the number and the names of the imported captures."""
-            return f"{len(names)} capture{'s' * (len(names) != 1)} imported: {', '.join(names)}"
+        self._submit(IMPORTING, import_and_process, lambda names: describe_import(names, role))
 
-        self._submit(IMPORTING, import_and_process, describe)
-
-    def _read_zip(self, name: str, content: bytes, layout: str, options: dict[str, Any], report: Reporter) -> list[str]:
+    def _read_zip(
+        self, name: str, content: bytes, layout: str, role: Role, options: dict[str, Any], report: Reporter
+    ) -> list[str]:
         """Unpack an uploaded zip into a temporary folder and import it; returns the names of the captures."""
         store, archive = self._engine.store, io.BytesIO(content)
         report(0.0, f"unpacking {name}")
@@ -73,8 +76,8 @@ class ImportRequests(RequestHandler):
                 for warning in warnings:
                     self._warner("frames")(warning)
                 return import_captures(
-                    source, store.guarded(report.saving), layout, origin=name, progress=report.within(0.2, 1),
-                    warn=self._warner("frames"), **options,
+                    source, store.guarded(report.saving), layout, role=role, origin=name,
+                    progress=report.within(0.2, 1), warn=self._warner("frames"), **options,
                 )  # fmt: skip
             finally:
                 atomic.discard(staged)

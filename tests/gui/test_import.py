@@ -54,7 +54,7 @@ def test_an_uploaded_zip_becomes_poses(opened: Opened, operator: Operator) -> No
         if name == "broken.zip":
             expect(page.get_by_text(re.compile("the file is no zip")).first).to_be_visible()
             expect(button(page, "Upload zip")).to_be_enabled()
-    expect(page.get_by_text("1 capture imported: capture_0").first).to_be_visible(timeout=PATIENCE_MS)
+    expect(page.get_by_text("1 capture imported as a target pose: capture_0").first).to_be_visible(timeout=PATIENCE_MS)
     expect(page.get_by_text(re.compile("not imported: capture_1: it lacks graycode_04")).first).to_be_visible()
     expect(page.get_by_text(re.compile("notes.txt in the zip")).first).to_be_visible()
     session = operator.session

@@ -228,9 +228,10 @@ def test_the_terminal_measures_relates_names_and_writes_a_table(folder, balls, r
         assert len(warnings) == 1 and "stereo" in warnings[0] and "splined" in warnings[0], wrong
     status, said, _ = run("measure", folder, "balls", "distance", "--at", u, v, x, y)
     assert status == 0 and said.startswith("m3 ") and "distance 8" in said
-    status, said, _ = run(
+    status, said, wrong = run(
         "measurements", folder, "--relate", "m1", "m2", "--name", "m3", "tops", "--csv", tmp_path / "m.csv"
     )
+    assert "left – right: U is too small, as the model stereo does not know the calibration's part" in wrong
     assert status == 0 and "left – right" in said and "tops (distance" in said and "4 measurements ->" in said
     assert (tmp_path / "m.csv").read_text("utf-8-sig").startswith("id,name,kind")
     assert "m4" not in run("measurements", folder, "--delete", "m4")[1]

@@ -56,7 +56,7 @@ def test_a_folder_becomes_poses_and_what_is_skipped_is_said(operator: Operator, 
     assert operator.import_folder(f" {source} ", projector="120x90")
     view = operator.wait_until_idle(60).session
     assert view is not None and [pose.name for pose in view.poses] == ["capture_0", "capture_2"]
-    assert any("2 captures imported" in text for text in texts(operator, "good"))
+    assert any("2 captures imported as target poses: capture_0, capture_2" in text for text in texts(operator, "good"))
     assert any("capture_1" in text and "graycode_05" in text for text in texts(operator, "warning"))
 
 
@@ -65,6 +65,7 @@ def test_a_zip_becomes_scans_and_leaves_nothing_behind(operator: Operator, sourc
     view = operator.wait_until_idle(60).session
     assert view is not None and [scan.name for scan in view.scans] == ["capture_0", "capture_2"]
     assert any("notes.txt" in text for text in texts(operator, "warning"))
+    assert any("2 captures imported as scans" in text for text in texts(operator, "good"))
     assert operator.session is not None
     assert operator.session.load_capture("capture_0").meta["source"] == "my scans.zip"
     assert not [path for path in operator.session.folder.iterdir() if "import" in path.name]
