@@ -11,6 +11,8 @@ import numpy as np
 from slviewer.devices.protocols import Camera, CameraSettings, Projector, Rig, Turntable
 from slviewer.errors import DeviceError, InputError, TurntableError
 from slviewer.fringe.sequence import PatternSequence
+from slviewer.pipeline.rig_choice import Choice, RigSetup, set_up
+from slviewer.target.board import Board
 
 Fault = Literal["timeout", "unplugged", "projector", "turntable"]
 """The camera gives no frame once; the camera is gone until it is closed and opened; the same for the projector; the
@@ -154,3 +156,14 @@ def breakable(rig: Rig) -> tuple[Rig, Faults]:
     table = None if rig.turntable is None else FaultyTurntable(rig.turntable, faults)
     camera, projector = FaultyCamera(rig.camera, faults), FaultyProjector(rig.projector, faults)
     return Rig(rig.name, camera, projector, turntable=table), faults
+
+
+class FaultyRigs:
+    """Sets rigs up as usual, with faults that can be planned."""
+
+    faults: Faults
+
+    def __call__(self, choice: Choice, board: Board | None) -> RigSetup:
+        bench = set_up(choice, board)
+        rig, self.faults = breakable(bench.rig)
+        return RigSetup(rig, bench.world, bench.focal_px)

@@ -13,6 +13,7 @@ from slviewer.errors import InputError
 from slviewer.fringe.presets import p18
 from slviewer.fringe.sequence import PatternSequence, one_axis
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
+from slviewer.pipeline.models import save_imported_stereo
 from slviewer.session.capture import NewCapture
 from slviewer.session.ply import write_ply
 from slviewer.session.store import Session
@@ -110,3 +111,20 @@ def turn_plan(rig: SimulatedRig, board: Board, poses: int) -> dict[str, Scene]:
         for i, pose in enumerate(target_poses(rig, board, poses), 1)
     }
     return {**targets, **objects(moved=True), **turning()}
+
+
+def save_true_stereo(store: Session, rig: SimulatedRig, **other: np.ndarray) -> None:
+    """Make a simulated rig's true lenses and pose the session's stereo calibration, local distortion apart.
+
+    ``other``: matrices K_camera (3, 3), D_camera (5,), K_projector, D_projector, R (3, 3) or T (3,) mm that replace the
+    true ones.
+    """
+    record = rig_record(rig)
+    lenses = {f"{name}_{device}": np.array(record[device][name]) for name in "KD" for device in ("camera", "projector")}
+    save_imported_stereo(
+        store,
+        {**lenses, "R": rig.R, "T": rig.t, **other},
+        source="the simulation's truth",
+        camera=rig.camera.size,
+        projector=rig.projector.size,
+    )

@@ -23,11 +23,10 @@ from websockets.sync.connection import Connection
 from slviewer.errors import SlviewerError
 from slviewer.gui.app import App
 from slviewer.pipeline.feedback import Progress, ignore_progress
-from slviewer.pipeline.models import save_imported_stereo
+from slviewer.pipeline.simulate import save_true_stereo
 from slviewer.server.secure import SafeServer, Serving
 from slviewer.session.store import Session
 from slviewer.simulation.rig import SimulatedRig, letter
-from slviewer.simulation.truth import rig_record
 from slviewer.wizard.operator import Operator
 
 _VIEWPOINT = {
@@ -227,13 +226,8 @@ def _serve_wizard(operator: Operator) -> Iterator[SafeServer]:
 
 def true_calibration(folder: Path, rig: SimulatedRig) -> None:
     """Make a session whose stereo calibration is that of a simulated rig's true lenses, local distortion apart."""
-    record = rig_record(rig)
-    matrices = {f"{m}_{d}": np.array(record[d][m]) for m in ("K", "D") for d in ("camera", "projector")}
-    matrices |= {"R": np.array(record["R"]), "T": np.array(record["t"])}
     with Session.create(folder) as store:
-        save_imported_stereo(
-            store, matrices, source="the simulation's truth", camera=rig.camera.size, projector=rig.projector.size
-        )
+        save_true_stereo(store, rig)
 
 
 def _wait_until(condition: Callable[[], bool], operator: Operator) -> None:

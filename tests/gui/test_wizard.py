@@ -10,15 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from faulty_rig import Faults, breakable
+from faulty_rig import FaultyRigs
 from playwright.sync_api import Browser, Page, expect
 from wizard_page import PATIENCE_MS, SIZE, Opened, button, capture_pose, choose, click, field, pose_row, press
 
 from slviewer.gui.app import App
-from slviewer.pipeline.rig_choice import Choice, RigSetup, set_up
 from slviewer.server.secure import Serving
 from slviewer.session.store import Session
-from slviewer.target.board import Board
 from slviewer.wizard import tasks
 from slviewer.wizard.operator import Operator
 from slviewer.wizard.snapshot import SessionView
@@ -311,19 +309,8 @@ def test_a_killed_capture_costs_no_earlier_pose(tmp_path: Path, browser: Browser
 # devices that fail
 
 
-class Breakable:
-    """Sets rigs up as usual, with faults that can be planned."""
-
-    faults: Faults
-
-    def __call__(self, choice: Choice, board: Board | None) -> RigSetup:
-        bench = set_up(choice, board)
-        rig, self.faults = breakable(bench.rig)
-        return RigSetup(rig, bench.world, bench.focal_px)
-
-
 def test_a_fault_ends_one_capture_and_says_so(tmp_path: Path, browser: Browser) -> None:
-    rigs = Breakable()
+    rigs = FaultyRigs()
     with Operator(tmp_path / "session", RIG, set_up=rigs) as operator:
         assert operator.wait_for(lambda s: s.rig.state == "open", PATIENCE_S)
         operator.choose_target(TARGET)

@@ -9,7 +9,6 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
 import pytest
 from distributed import Client
 
@@ -18,15 +17,14 @@ from slviewer.errors import Cancelled, SlviewerError, UsageError
 from slviewer.fringe.presets import p18
 from slviewer.fringe.sequence import one_axis
 from slviewer.pipeline.batch import batch
-from slviewer.pipeline.models import save_imported_stereo
 from slviewer.pipeline.reconstruct import reconstruct
+from slviewer.pipeline.simulate import save_true_stereo
 from slviewer.pipeline.verify import verify
 from slviewer.session.ply import read_ply
 from slviewer.session.store import Session
 from slviewer.simulation.plans import letter_plan
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import letter
-from slviewer.simulation.truth import rig_record
 from slviewer.target.board import Board
 
 pytestmark = pytest.mark.slow
@@ -39,12 +37,10 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A session of two spheres and three planes whose imported calibration is the truth; read-only."""
     folder = tmp_path_factory.mktemp("batch") / "session"
     rig = letter(0.15, seed=2, local_distortion_px=0)
-    record, sequence = rig_record(rig), one_axis(p18(rig.projector.size), "x")
+    sequence = one_axis(p18(rig.projector.size), "x")
     plan = letter_plan(rig, Board.parse("circles:21x16:9"), 3)
     with Session.create(folder) as store:
-        matrices = {f"{m}_{d}": np.array(record[d][m]) for m in ("K", "D") for d in ("camera", "projector")}
-        matrices |= {"R": np.array(record["R"]), "T": np.array(record["t"])}
-        save_imported_stereo(store, matrices, source="truth", camera=rig.camera.size, projector=rig.projector.size)
+        save_true_stereo(store, rig)
         for i, name in enumerate((*SPHERES, *PLANES)):
             store.save_capture(
                 name, "scan", sequence, Renderer(rig, plan[name]).capture(sequence, i), source="simulated"

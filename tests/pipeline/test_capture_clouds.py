@@ -9,26 +9,17 @@ import pytest
 
 from slviewer.fringe.presets import multifrequency
 from slviewer.fringe.sequence import PatternSequence
-from slviewer.pipeline.models import save_imported_stereo
+from slviewer.pipeline.simulate import save_true_stereo
 from slviewer.session.ply import read_ply
 from slviewer.session.store import Session
 from slviewer.simulation.boards import FLAT, BoardScene, Pose
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import letter
-from slviewer.simulation.truth import rig_record
 
 pytestmark = pytest.mark.slow
 
 Run = Callable[..., tuple[int, str, str]]
 RIG = letter(0.1, 3, local_distortion_px=0.0)
-RECORD = rig_record(RIG)
-MATRICES = {f"{m}_{d}": np.array(RECORD[d][m]) for m in ("K", "D") for d in ("camera", "projector")}
-MATRICES |= {"R": RIG.R, "T": RIG.t}
-
-
-def calibrate(store: Session, **other: np.ndarray) -> None:
-    """Make the true rig, or matrices that differ from it, the session's calibration."""
-    save_imported_stereo(store, MATRICES | other, source="truth", camera=RIG.camera.size, projector=RIG.projector.size)
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +38,7 @@ def session(tmp_path: Path, captured: tuple[PatternSequence, np.ndarray]) -> Pat
     """The plate as it is, as a scan of a projector twice the size, and by a camera that was cropped."""
     sequence, frames = captured
     with Session.create(tmp_path / "session") as store:
-        calibrate(store)
+        save_true_stereo(store, RIG)
         store.save_capture("sound", "scan", sequence, frames, source="test")
         large = replace(sequence, projector_size=tuple(2 * n for n in RIG.projector.size))
         store.save_capture("large", "scan", large, frames, source="test")
@@ -77,7 +68,7 @@ def test_a_sound_capture_is_measured_without_a_word(session: Path, run: Run) -> 
 
 def test_an_inverted_calibration_is_refused_and_may_be_insisted_on(session: Path, run: Run) -> None:
     with Session.open(session, write=True) as store:
-        calibrate(store, R=RIG.R.T, T=-RIG.R.T @ RIG.t)
+        save_true_stereo(store, RIG, R=RIG.R.T, T=-RIG.R.T @ RIG.t)
     for command in (
         ("reconstruct", session, "sound"),
         ("mesh", session, "sound"),
@@ -94,7 +85,7 @@ def test_sigma_is_raised_where_the_axes_miss_each_other(session: Path, run: Run,
     nod = np.array([[1, 0, 0], [0, 1, -2e-4], [0, 2e-4, 1]])
     turn = np.linalg.svd(nod)
     with Session.open(session, write=True) as store:
-        calibrate(store, R=turn.U @ turn.Vh @ RIG.R, T=turn.U @ turn.Vh @ RIG.t)
+        save_true_stereo(store, RIG, R=turn.U @ turn.Vh @ RIG.R, T=turn.U @ turn.Vh @ RIG.t)
     status, _, error = run("reconstruct", session, "sound", "--out", tmp_path / "bumped.ply")
     assert status == 0 and "factor" in error
     sound, bumped = (read_ply(tmp_path / f"{name}.ply").scalars["sigma_noise"] for name in ("sound", "bumped"))

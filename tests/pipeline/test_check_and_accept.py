@@ -14,15 +14,15 @@ from slviewer.fringe.sequence import one_axis
 from slviewer.pipeline.accept import accept
 from slviewer.pipeline.calibrate import calibrate
 from slviewer.pipeline.check import REFERENCE, check, load_drift_history
-from slviewer.pipeline.models import load_stereo, save_imported_stereo
+from slviewer.pipeline.models import load_stereo
 from slviewer.pipeline.scale import scale_factor
+from slviewer.pipeline.simulate import save_true_stereo
 from slviewer.session.store import Session
 from slviewer.simulation.boards import printed_board
 from slviewer.simulation.plans import rotation, target_poses
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import letter
 from slviewer.simulation.scenes import Spheres
-from slviewer.simulation.truth import rig_record
 from slviewer.target.board import Board
 
 pytestmark = pytest.mark.slow
@@ -53,11 +53,9 @@ def measured(tmp_path_factory) -> Path:
     """A session whose imported calibration is the truth, with seven bars and four captures of the first one."""
     folder = tmp_path_factory.mktemp("accept") / "session"
     rig = letter(0.25, seed=2, local_distortion_px=0)
-    record, sequence = rig_record(rig), one_axis(p18(rig.projector.size), "x")
+    sequence = one_axis(p18(rig.projector.size), "x")
     with Session.create(folder) as store:
-        matrices = {f"{m}_{d}": np.array(record[d][m]) for m in ("K", "D") for d in ("camera", "projector")}
-        matrices |= {"R": np.array(record["R"]), "T": np.array(record["t"])}
-        save_imported_stereo(store, matrices, source="truth", camera=rig.camera.size, projector=rig.projector.size)
+        save_true_stereo(store, rig)
         for i, place in enumerate(bar_places(load_stereo(store).rig, (500.0, 700.0), 100.0, 38.1)):
             T = place.T_camera_artefact
             renderer = Renderer(rig, Spheres(T[:3, 3] + np.array([[-50.0], [50.0]]) * T[:3, 0], 19.05))

@@ -18,8 +18,8 @@ from slviewer.fringe.sequence import one_axis
 from slviewer.inspection.regions import Region
 from slviewer.pipeline import measurements
 from slviewer.pipeline.measured_surface import MeasuredSurface, load_surface
-from slviewer.pipeline.models import save_imported_stereo
 from slviewer.pipeline.report import report
+from slviewer.pipeline.simulate import save_true_stereo
 from slviewer.session.ply import read_ply, write_ply
 from slviewer.session.store import Session
 from slviewer.simulation.assets import asset
@@ -28,7 +28,6 @@ from slviewer.simulation.mesh import demo_object
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import letter
 from slviewer.simulation.scenes import Spheres
-from slviewer.simulation.truth import rig_record
 
 pytestmark = pytest.mark.slow
 
@@ -42,15 +41,13 @@ def made(tmp_path_factory) -> Path:
     """A session whose imported calibration is the truth, with a scan of the demo object and one of two balls."""
     folder = tmp_path_factory.mktemp("measuring") / "session"
     rig = letter(0.2, seed=2, local_distortion_px=0)
-    record, sequence = rig_record(rig), one_axis(p18(rig.projector.size), "x")
+    sequence = one_axis(p18(rig.projector.size), "x")
     scenes = {
         "object": demo_object(Pose(np.eye(3), np.array([0.0, 0.0, 520.0]))),
         "balls": Spheres(CENTRES, RADIUS),
     }
     with Session.create(folder) as store:
-        matrices = {f"{m}_{d}": np.array(record[d][m]) for m in ("K", "D") for d in ("camera", "projector")}
-        matrices |= {"R": np.array(record["R"]), "T": np.array(record["t"])}
-        save_imported_stereo(store, matrices, source="truth", camera=rig.camera.size, projector=rig.projector.size)
+        save_true_stereo(store, rig)
         for i, (name, scene) in enumerate(scenes.items()):
             frames = Renderer(rig, scene).capture(sequence, i)
             store.save_capture(name, "scan", sequence, frames, source="simulated")

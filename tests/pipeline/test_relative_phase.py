@@ -10,20 +10,16 @@ import pytest
 
 from slviewer.fringe.presets import multifrequency
 from slviewer.fringe.sequence import PatternSequence
-from slviewer.pipeline.models import save_imported_stereo
+from slviewer.pipeline.simulate import save_true_stereo
 from slviewer.session.store import Session
 from slviewer.simulation.boards import FLAT, BoardScene, Pose
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import letter
-from slviewer.simulation.truth import rig_record
 
 pytestmark = pytest.mark.slow
 
 Run = Callable[..., tuple[int, str, str]]
 RIG = letter(0.25, 3, local_distortion_px=0.0)
-RECORD = rig_record(RIG)
-MATRICES = {f"{m}_{d}": np.array(RECORD[d][m]) for m in ("K", "D") for d in ("camera", "projector")}
-MATRICES |= {"R": RIG.R, "T": RIG.t}
 DEPTH = 600.0
 
 
@@ -39,7 +35,7 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
     frames = Renderer(RIG, plate).capture(absolute, 1)
     folder = tmp_path_factory.mktemp("relative") / "session"
     with Session.create(folder) as store:
-        save_imported_stereo(store, MATRICES, source="truth", camera=RIG.camera.size, projector=RIG.projector.size)
+        save_true_stereo(store, RIG)
         store.save_capture("absolute", "scan", absolute, frames, source="test")
         store.save_capture("relative", "scan", relative, frames[finer], source="test")
         unknown = replace(relative, projector_size=None, relative=False)

@@ -12,8 +12,8 @@ from faulty_rig import breakable
 
 from slviewer.errors import Cancelled, DeviceError, InputError, TurntableError, UsageError
 from slviewer.pipeline.merge import merge
-from slviewer.pipeline.models import save_imported_stereo
 from slviewer.pipeline.rig_choice import Choice, RigSetup, set_up
+from slviewer.pipeline.simulate import save_true_stereo
 from slviewer.pipeline.turn import align_turn, capture_turn, missing_steps, next_turn, plan_turn, recorded_steps, turn
 from slviewer.registration.open3d_loader import open3d
 from slviewer.registration.refusal import Refused
@@ -21,7 +21,6 @@ from slviewer.session.capture import TurnStep
 from slviewer.session.store import Session
 from slviewer.session.toml import to_toml
 from slviewer.simulation.rig import letter
-from slviewer.simulation.truth import rig_record
 from slviewer.simulation.turning import stone, turning
 
 SCALE = 0.15
@@ -32,11 +31,8 @@ TINY = {**RIG, "scale": 0.05}
 def calibrated(folder: Path, scale: float = SCALE) -> Path:
     """A session whose calibration is the truth, but for the lenses' local distortion."""
     rig = letter(scale)
-    record = rig_record(rig)
-    matrices = {f"{m}_{d}": np.array(record[d][m]) for m in ("K", "D") for d in ("camera", "projector")}
-    matrices |= {"R": np.array(record["R"]), "T": np.array(record["t"])}
     with Session.create(folder) as store:
-        save_imported_stereo(store, matrices, source="truth", camera=rig.camera.size, projector=rig.projector.size)
+        save_true_stereo(store, rig)
     return folder
 
 

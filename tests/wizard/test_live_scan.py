@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from faulty_rig import Faults, breakable
+from faulty_rig import FaultyRigs
 
 from slviewer.calibration.pixelwise import PixelFit, PixelwiseModel
 from slviewer.devices.protocols import CameraSettings
@@ -16,12 +16,10 @@ from slviewer.devices.world import SimulatedWorld
 from slviewer.fringe.decode import decode
 from slviewer.fringe.presets import short
 from slviewer.pipeline.capture_phases import decode_capture
-from slviewer.pipeline.models import load_stereo, save_imported_stereo
-from slviewer.pipeline.rig_choice import Choice, RigSetup, set_up
+from slviewer.pipeline.models import load_stereo
+from slviewer.pipeline.simulate import save_true_stereo
 from slviewer.session.store import Session
 from slviewer.simulation.rig import letter
-from slviewer.simulation.truth import rig_record
-from slviewer.target.board import Board
 from slviewer.wizard import acquisition
 from slviewer.wizard.live_frames import Stream
 from slviewer.wizard.live_scan import LiveCloud, LiveModel
@@ -37,24 +35,16 @@ SETTINGS = CameraSettings(1.0, 1.0)
 class Wizard:
     """A wizard over a session that is calibrated with the truth, and the live clouds that it made."""
 
-    faults: Faults
-
     def __init__(self, folder: Path) -> None:
-        record = rig_record(rig := letter(SCALE))
-        matrices = {f"{m}_{d}": np.array(record[d][m]) for m in ("K", "D") for d in ("camera", "projector")}
-        matrices |= {"R": np.array(record["R"]), "T": np.array(record["t"])}
+        rig = letter(SCALE)
         with Session.create(folder) as store:
-            save_imported_stereo(store, matrices, source="truth", camera=rig.camera.size, projector=rig.projector.size)
+            save_true_stereo(store, rig)
+        self.rigs = FaultyRigs()
         self.clouds: list[LiveCloud] = []
-        self.operator = Operator(folder, RIG, set_up=self._set_up)
+        self.operator = Operator(folder, RIG, set_up=self.rigs)
         self.operator.subscribe_live(self.clouds.append)
         assert self.operator.wait_for(lambda s: s.rig.state == "open", 10)
         self.operator.place("object")
-
-    def _set_up(self, choice: Choice, board: Board | None) -> RigSetup:
-        bench = set_up(choice, board)
-        rig, self.faults = breakable(bench.rig)
-        return RigSetup(rig, bench.world, bench.focal_px)
 
     def goes_on(self, more: int = 3) -> None:
         seen = len(self.clouds)
@@ -139,7 +129,7 @@ def test_a_fault_ends_it_with_a_sentence_and_what_was_kept_stays(wizard: Wizard)
     assert operator.start_live()
     wizard.goes_on()
     assert operator.save_live()
-    wizard.faults.plan("unplugged", 4)
+    wizard.rigs.faults.plan("unplugged", 4)
     assert wizard.told("the camera does not answer")
     wizard.ends()
     assert wizard.told("the rig answers again")

@@ -19,7 +19,7 @@ from slviewer.pipeline.measurements import (
     add_section,
     load_measurements,
 )
-from slviewer.pipeline.models import save_imported_stereo
+from slviewer.pipeline.simulate import save_true_stereo
 from slviewer.session.inspection_plan import read_plan
 from slviewer.session.store import Session
 from slviewer.simulation.assets import asset
@@ -28,7 +28,6 @@ from slviewer.simulation.mesh import demo_object
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import letter
 from slviewer.simulation.scenes import Spheres
-from slviewer.simulation.truth import rig_record
 from slviewer.wizard.measure_requests import plain_name
 from slviewer.wizard.operator import Operator
 from slviewer.wizard.snapshot import SessionView
@@ -45,12 +44,10 @@ def operator(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Operator]:
     """Over a session whose calibration is the truth, with two balls and the demo object reconstructed."""
     folder = tmp_path_factory.mktemp("measuring") / "session"
     rig = letter(0.2, seed=2, local_distortion_px=0)
-    record, sequence = rig_record(rig), one_axis(p18(rig.projector.size), "x")
+    sequence = one_axis(p18(rig.projector.size), "x")
     scenes = {"balls": Spheres(CENTRES, RADIUS), "object": demo_object(Pose(np.eye(3), np.array([0.0, 0.0, 520.0])))}
     with Session.create(folder) as store:
-        matrices = {f"{m}_{d}": np.array(record[d][m]) for m in ("K", "D") for d in ("camera", "projector")}
-        matrices |= {"R": np.array(record["R"]), "T": np.array(record["t"])}
-        save_imported_stereo(store, matrices, source="truth", camera=rig.camera.size, projector=rig.projector.size)
+        save_true_stereo(store, rig)
         for i, (name, scene) in enumerate(scenes.items()):
             store.save_capture(name, "scan", sequence, Renderer(rig, scene).capture(sequence, i), source="simulated")
     with Operator(folder) as engine:

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from slviewer.fringe.presets import p18
 from slviewer.fringe.sequence import one_axis
-from slviewer.pipeline.models import save_imported_stereo
+from slviewer.pipeline.simulate import save_true_stereo
 from slviewer.session.ply import read_ply
 from slviewer.session.store import Session
 from slviewer.simulation.boards import Pose
@@ -17,7 +17,6 @@ from slviewer.simulation.mesh import demo_object
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import letter
 from slviewer.simulation.scenes import Spheres
-from slviewer.simulation.truth import rig_record
 from slviewer.wizard import result_views
 from slviewer.wizard.operator import Operator
 from slviewer.wizard.result_views import merge_view
@@ -41,13 +40,11 @@ def operator(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Operator]:
     """Over a session whose calibration is the truth, with three turned scans of the demo object, and two of a ball."""
     folder = tmp_path_factory.mktemp("merging") / "session"
     rig = letter(0.2, seed=2, local_distortion_px=0)
-    record, sequence = rig_record(rig), one_axis(p18(rig.projector.size), "x")
+    sequence = one_axis(p18(rig.projector.size), "x")
     balls = {f"ball_{k}": Spheres(MIDDLE[None] + [[8.0 * k, 0, 0]], 60.0) for k in range(2)}
     scenes = {name: demo_object(turned(k)) for k, name in enumerate(NAMES)} | balls
     with Session.create(folder) as store:
-        matrices = {f"{m}_{d}": np.array(record[d][m]) for m in ("K", "D") for d in ("camera", "projector")}
-        matrices |= {"R": np.array(record["R"]), "T": np.array(record["t"])}
-        save_imported_stereo(store, matrices, source="truth", camera=rig.camera.size, projector=rig.projector.size)
+        save_true_stereo(store, rig)
         for i, (name, scene) in enumerate(scenes.items()):
             store.save_capture(name, "scan", sequence, Renderer(rig, scene).capture(sequence, i), source="simulated")
     with Operator(folder) as engine:

@@ -8,11 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from faulty_rig import Faults, breakable
+from faulty_rig import FaultyRigs
 
-from slviewer.pipeline.rig_choice import Choice, RigSetup, set_up
 from slviewer.session.store import Session
-from slviewer.target.board import Board
 from slviewer.wizard import acquisition, preview_watcher
 from slviewer.wizard.operator import Operator
 from slviewer.wizard.snapshot import Snapshot
@@ -24,25 +22,14 @@ TARGET = "circles:21x16:9"
 ROOT = Path(__file__).parents[3]
 
 
-class Breakable:
-    """Sets rigs up as usual, with faults that can be planned."""
-
-    faults: Faults
-
-    def __call__(self, choice: Choice, board: Board | None) -> RigSetup:
-        bench = set_up(choice, board)
-        rig, self.faults = breakable(bench.rig)
-        return RigSetup(rig, bench.world, bench.focal_px)
-
-
 @pytest.fixture
-def rigs(monkeypatch: pytest.MonkeyPatch) -> Breakable:
+def rigs(monkeypatch: pytest.MonkeyPatch) -> FaultyRigs:
     monkeypatch.setattr(acquisition, "RETRY_S", 0.1)
-    return Breakable()
+    return FaultyRigs()
 
 
 @pytest.fixture
-def operator(tmp_path: Path, rigs: Breakable) -> Iterator[Operator]:
+def operator(tmp_path: Path, rigs: FaultyRigs) -> Iterator[Operator]:
     with Operator(tmp_path / "session", RIG, set_up=rigs) as operator:
         operator.choose_target(TARGET)
         opened(operator)
@@ -79,7 +66,7 @@ def test_requests_that_cannot_be_granted_become_notices() -> None:
         assert operator.snapshot().session is None and operator.snapshot().step("poses").state == "blocked"
 
 
-def test_poses_are_judged_kept_and_found_again(operator: Operator, rigs: Breakable, tmp_path: Path) -> None:
+def test_poses_are_judged_kept_and_found_again(operator: Operator, rigs: FaultyRigs, tmp_path: Path) -> None:
     versions: list[int] = []
     operator.subscribe(lambda snapshot: versions.append(snapshot.version))
     before = operator.wait_until_idle()
@@ -127,7 +114,7 @@ def test_poses_are_judged_kept_and_found_again(operator: Operator, rigs: Breakab
 
 
 @pytest.mark.parametrize("fault", ["timeout", "unplugged"])
-def test_a_device_that_fails_leaves_no_half_capture(operator: Operator, rigs: Breakable, fault) -> None:
+def test_a_device_that_fails_leaves_no_half_capture(operator: Operator, rigs: FaultyRigs, fault) -> None:
     store = operator.session
     assert store is not None and operator.place_at_suggestion()
     rigs.faults.plan(fault, 12)

@@ -3,17 +3,13 @@
 from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
 import pytest
 import trimesh
-from faulty_rig import Faults, breakable
+from faulty_rig import FaultyRigs
 
-from slviewer.pipeline.models import save_imported_stereo
-from slviewer.pipeline.rig_choice import Choice, RigSetup, set_up
+from slviewer.pipeline.simulate import save_true_stereo
 from slviewer.session.store import Session
 from slviewer.simulation.rig import letter
-from slviewer.simulation.truth import rig_record
-from slviewer.target.board import Board
 from slviewer.wizard import acquisition
 from slviewer.wizard.operator import Operator
 from slviewer.wizard.snapshot import Snapshot
@@ -24,32 +20,18 @@ SCALE = 0.12
 RIG = {"driver": "simulated", "scale": SCALE, "turntable": {"driver": "simulated"}}
 
 
-class Breakable:
-    """Sets rigs up as usual, with faults that can be planned."""
-
-    faults: Faults
-
-    def __call__(self, choice: Choice, board: Board | None) -> RigSetup:
-        bench = set_up(choice, board)
-        rig, self.faults = breakable(bench.rig)
-        return RigSetup(rig, bench.world, bench.focal_px)
-
-
 @pytest.fixture
-def rigs(monkeypatch: pytest.MonkeyPatch) -> Breakable:
+def rigs(monkeypatch: pytest.MonkeyPatch) -> FaultyRigs:
     monkeypatch.setattr(acquisition, "RETRY_S", 0.1)
-    return Breakable()
+    return FaultyRigs()
 
 
 @pytest.fixture
-def operator(tmp_path: Path, rigs: Breakable) -> Iterator[Operator]:
+def operator(tmp_path: Path, rigs: FaultyRigs) -> Iterator[Operator]:
     """With a calibration that is the truth, but for the lenses' local distortion."""
     rig = letter(SCALE)
-    record = rig_record(rig)
-    matrices = {f"{m}_{d}": np.array(record[d][m]) for m in ("K", "D") for d in ("camera", "projector")}
-    matrices |= {"R": np.array(record["R"]), "T": np.array(record["t"])}
     with Session.create(tmp_path / "session") as store:
-        save_imported_stereo(store, matrices, source="truth", camera=rig.camera.size, projector=rig.projector.size)
+        save_true_stereo(store, rig)
     with Operator(tmp_path / "session", RIG, set_up=rigs) as operator:
         assert operator.wait_for(lambda s: s.rig.state == "open", 20)
         yield operator
@@ -76,7 +58,7 @@ def test_one_request_ends_in_a_watertight_mesh(operator: Operator) -> None:
     assert any(n.level == "good" and "watertight" in n.text for n in done.notices), [n.text for n in done.notices]
 
 
-def test_a_turn_that_fails_or_is_cancelled_is_resumed(operator: Operator, rigs: Breakable) -> None:
+def test_a_turn_that_fails_or_is_cancelled_is_resumed(operator: Operator, rigs: FaultyRigs) -> None:
     rigs.faults.plan("turntable", 240)
     assert operator.scan_all_round(3, then_merge=False)
     failed = operator.wait_until_idle(120)
