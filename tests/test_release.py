@@ -67,8 +67,9 @@ def test_an_sdist_holds_sources_docs_tests_and_assets_and_no_caches(built) -> No
 def test_a_wheel_works_without_the_checkout(built, tmp_path) -> None:
     with zipfile.ZipFile(built[1]) as archive:
         names = set(archive.namelist())
-    data = "report/page.html.j2 report/page.css server/login.html server/projector.html server/camera.html py.typed"
-    assert {f"slviewer/{name}" for name in (*data.split(), "assets/rigs/webcam.toml", "_version.py")} <= names
+    pages = {f"server/{name}" for name in ("login.html", "projector.html", "camera.html", "device_page.js")}
+    data = {"report/page.html.j2", "report/page.css", "py.typed", "assets/rigs/webcam.toml", "_version.py", *pages}
+    assert {f"slviewer/{name}" for name in data} <= names
     assert not [name for name in names if not name.startswith(("slviewer/", "slviewer-"))]
 
     # The wheel in an environment of its own; its dependencies are those of this environment, which need no network.

@@ -18,6 +18,8 @@ from slviewer.server.secure import SafeServer
 ANOTHER_WINDOW, NOT_UNDERSTOOD = 4001, 1008
 """Why the connection was closed: the page then waits for somebody to ask for it, or connects again."""
 _HELLO_S = 5.0
+_SHARED = "device_page.js"
+"""Script of both pages, put into each of them: their roles are served nothing but their page."""
 
 
 def serve_device_pages(server: SafeServer, channels: PageChannels) -> None:
@@ -34,8 +36,8 @@ def _serve_page(server: SafeServer, role: Role, name: str, channel: PageChannel[
         with contextlib.suppress(ConnectionClosed):
             await _talk(connection, channel)
 
-    html = resources.files("slviewer.server").joinpath(name).read_bytes()
-    server.device_pages[role] = DevicePage(html, handle)
+    html, script = (resources.files("slviewer.server").joinpath(file).read_text("utf-8") for file in (name, _SHARED))
+    server.device_pages[role] = DevicePage(html.replace(f"/* {_SHARED} */", script).encode(), handle)
 
 
 async def _talk(connection: ServerConnection, channel: PageChannel[Any]) -> None:

@@ -254,7 +254,7 @@ def test_a_reload_ends_the_capture_and_the_next_one_is_whole(opens, channel, pro
 def test_a_lost_connection_is_made_again_by_the_page(opens, channel, projector):
     page = opens()
     ready(channel, projector)
-    page.evaluate("socket.close()")
+    page.evaluate("link.socket.close()")
     assert until(lambda: channel.page_state().state == "waiting")
     fails("connection was lost", projector.show, 0)
     assert channel.wait_ready(5.0).state == "ready"
