@@ -29,6 +29,9 @@ from slviewer.session.measurements import Measurement
 from slviewer.session.nominal import read_nominal
 
 TOLERANCE_MM = 0.1
+LEAST_TOLERANCE_MM, MOST_TOLERANCE_MM = 1e-3, 1e3
+_DECIMALS = 4
+"""Of nominal values and limits in a plan."""
 FITTED = ("plane", "sphere", "cylinder")
 FORM_OF = {"plane": "flatness", "sphere": "roundness", "cylinder": "cylindricity"}
 
@@ -54,8 +57,11 @@ def plan(
         datums: Align by these three measurements (3-2-1), such as m1 m2 m3: a plane, then planes or spheres.
         nominal: Align by the best fit to this STL, PLY or OBJ file. By default parts lie in one place, in a fixture.
     """
-    if not tolerance > 0:
-        raise UsageError(f"--tolerance is {tolerance:g}: give a positive one, in mm")
+    if not LEAST_TOLERANCE_MM <= tolerance <= MOST_TOLERANCE_MM:
+        raise UsageError(
+            f"--tolerance is {tolerance:g}: give {LEAST_TOLERANCE_MM:g} to {MOST_TOLERANCE_MM:g} mm, by default "
+            f"{TOLERANCE_MM:g}"
+        )
     if datums and nominal is not None:
         raise UsageError("--datums and --nominal were given: choose one way to align")
     made = make_plan(session, tolerance, datums or (), nominal, Path(out).stem, progress=progress, warn=warn)
@@ -126,8 +132,8 @@ def make_plan(
 
 def _around(name: str, quantity: Quantity, features: tuple[str, ...], tolerance: float) -> Characteristic:
     """A characteristic with a tolerance around its measured value."""
-    nominal = round(quantity.value, 4)
-    lower, upper = round(nominal - tolerance, 4), round(nominal + tolerance, 4)
+    nominal = round(quantity.value, _DECIMALS)
+    lower, upper = round(nominal - tolerance, _DECIMALS), round(nominal + tolerance, _DECIMALS)
     return Characteristic(name, quantity.name, features, nominal, lower, upper, quantity.unit)
 
 

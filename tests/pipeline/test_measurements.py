@@ -276,6 +276,9 @@ def test_measurements_are_repeated_by_a_plan(made: Path, run: Run, tmp_path: Pat
         assert run("measure", session, "balls", "sphere", "--ball", x, y, z, 15)[0] == 0
     run("measurements", session, "--relate", "m1", "m2")
     plan = tmp_path / "plan.toml"
+    for tolerance in (0, -1, 1e-320, 1e6):
+        status, _, wrong = run("plan", session, f"--out={plan}", f"--tolerance={tolerance}")
+        assert status == 2 and "give 0.001 to 1000 mm" in wrong and not plan.exists()
     status, text, _ = run("plan", session, "--out", plan, "--tolerance", 0.5)
     assert status == 0 and "6 characteristics of 2 features" in text
     results = tmp_path / "results"
