@@ -449,6 +449,7 @@ def main() -> int:
     parser.add_argument("--minutes", type=float, default=float("inf"))
     parser.add_argument("--count", type=int, default=None)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--cases", type=int, nargs="+", help="only these, by the numbers that an earlier run printed")
     options = parser.parse_args()
     count = options.count or (2000 if options.minutes == float("inf") else 10**9)
     outcomes: Counter[tuple[str, str, str]] = Counter()
@@ -460,7 +461,7 @@ def main() -> int:
         lasts = _warm_up(seed, folder)
         print("seconds of the processor: " + ", ".join(f"{name} {s:.1f}" for name, s in lasts.items()), flush=True)
         end = time.monotonic() + 60 * options.minutes
-        for number in range(count):
+        for number in options.cases or range(count):
             if time.monotonic() > end:
                 break
             for _ in range(ATTEMPTS):
