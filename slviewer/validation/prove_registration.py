@@ -48,6 +48,7 @@ POSES = 25
 SHIFT_MM, TURN_DEG = 0.020, 0.01
 LOOP_MM = 0.05
 MARKERS_MM = 0.05
+"""At full resolution; in proportion to the size of the pixels, in which corners are found, at less."""
 SECONDS = 5.0
 HONEST = (0.7, 1.5)
 """Predicted over true error, pooled over all pairs."""
@@ -155,7 +156,7 @@ def prove_registration(
         surfaces.append(BandCheck(what, f"refused as {wanted} (it was: {reason})", is_right, 1.0, 1.0))
     for k, (what, marked) in enumerate(_make_marked_pairs().items()):
         progress(0.98, f"{what} by markers")
-        surfaces.append(_check_markers(rig, model, what, marked, T_calibrated_camera, 950 + 2 * k))
+        surfaces.append(_check_markers(rig, model, what, marked, T_calibrated_camera, 950 + 2 * k, scale))
     progress(1.0, "proven")
     rows = depths.rows() + turn.rows()
     checks += surfaces
@@ -272,6 +273,7 @@ def _check_markers(
     pair: tuple[MarkedScene, MarkedScene],
     T_calibrated_camera: np.ndarray,
     number: int,
+    scale: float,
 ) -> BandCheck:
     """The largest error over the surface of the second scan, registered by markers onto the first."""
     clouds = {}
@@ -286,7 +288,7 @@ def _check_markers(
     points = clouds["b"].measured[::_EVERY].astype(float)
     gap = move_points(T, points) - move_points(true[0] @ np.linalg.inv(true[1]), points)
     error = float(np.linalg.norm(gap, axis=1).max())
-    return BandCheck(f"two scans of a {what}, by markers", "largest error in mm", error, 1e-4, MARKERS_MM)
+    return BandCheck(f"two scans of a {what}, by markers", "largest error in mm", error, 1e-4, MARKERS_MM / scale)
 
 
 def _measure_motion(D: np.ndarray, centre: np.ndarray) -> tuple[float, float]:
