@@ -32,7 +32,7 @@ from slviewer.wizard.notices import Notices
 from slviewer.wizard.snapshot import LiveView
 
 REPORTS_PER_S = 3.0
-_AVERAGED_S = 2.0  # rates are averages over this time
+_AVERAGED_S = 2.0  # rates are averages over this time, or over the last two clouds where these came more slowly
 _RELOAD_S = 1.0  # between two checks whether the calibration has changed
 _RELEASE_S = 30.0  # between two releases of freed memory
 
@@ -82,6 +82,7 @@ class LiveScan:
         """Start capturing. Raises DeviceError if the rig is not ready, SlviewerError without a usable calibration."""
         self._model = LiveCalibration(self._store, self.stream.sequence, self.axis)
         self._acquisition.stream(self.stream)
+        self._made.append(time.monotonic())  # the first cloud has a rate too
         self._thread.start()
 
     @property
@@ -97,15 +98,15 @@ class LiveScan:
             _drop_old(self._sent, now)
 
     def figures(self) -> LiveView:
-        """Return the rates and the median latency of the last two seconds."""
+        """Return the rates and the median latency of the last seconds."""
         now = time.monotonic()
         with self._lock:
             _drop_old(self._made, now)
             _drop_old(self._sent, now)
             latency_s = float(np.median([late for _, late in self._sent])) if self._sent else None
             return LiveView(
-                clouds_per_s=_compute_rate(self._made),
-                shown_per_s=_compute_rate([at for at, _ in self._sent]),
+                clouds_per_s=_compute_rate(self._made, now),
+                shown_per_s=_compute_rate([at for at, _ in self._sent], now),
                 latency_ms=None if latency_s is None else 1e3 * latency_s,
                 points=self._points,
             )
@@ -224,12 +225,12 @@ class LiveCalibration:
         return LiveModel(self._sequence, self._axis, model, factor, load_stereo(store).rig)
 
 
-def _compute_rate(times: "deque[float] | list[float]") -> float:
-    """Return the rate per second of sorted times in s; 0 for fewer than two."""
-    return (len(times) - 1) / (times[-1] - times[0]) if len(times) > 1 and times[-1] > times[0] else 0.0
+def _compute_rate(times: "deque[float] | list[float]", now: float) -> float:
+    """Return the rate per second of sorted times in s, less where none has come for long; 0 for fewer than two."""
+    return (len(times) - 1) / max(times[-1] - times[0], now - times[-1], 1e-6) if len(times) > 1 else 0.0
 
 
 def _drop_old(times: "deque[float] | deque[tuple[float, float]]", now: float) -> None:
-    """Remove entries whose time in s is older than the averaging window from the front of a deque."""
-    while times and now - (times[0][0] if isinstance(times[0], tuple) else times[0]) > _AVERAGED_S:
+    """Remove entries whose time in s is older than the averaging window from the front of a deque, but the last two."""
+    while len(times) > 2 and now - (times[0][0] if isinstance(times[0], tuple) else times[0]) > _AVERAGED_S:
         times.popleft()

@@ -358,8 +358,8 @@ class SessionView:
 
 @dataclass(frozen=True)
 class LiveView:
-    """A live scan: clouds computed per second, and of those shown; `latency_ms`: the median from the start of a cloud's
-    capture until it is sent to the screens, None where no browser is open; `points` of the latest cloud.
+    """A live scan: clouds computed per second, 0 before the first, and of those shown; `latency_ms`: the median from
+    the start of a cloud's capture until it is sent to the screens, None before one was; `points` of the latest cloud.
     """
 
     clouds_per_s: float

@@ -65,7 +65,7 @@ def test_a_snapshot_that_fails_is_reported_and_built_again() -> None:
     tested.listeners.add(shown.append)
     tested.start()
     tested.mark_changed()
-    assert tested.wait_for(lambda snapshot: snapshot.autopilot == "done", 10)
+    assert tested.wait_for(lambda snapshot: snapshot.autopilot == "done", 60)
     tested.close()
     assert [snapshot.version for snapshot in shown] == [1, 2, 3, 4]
     assert "KeyError" in shown[0].read_failure and "Input/output error" in shown[1].read_failure
@@ -82,7 +82,7 @@ def test_what_is_sound_is_shown_and_what_is_not_is_named(folder: Path) -> None:
     for name in ("clouds/scan_01", "calibration/stereo"):
         (folder / "results" / name / "meta.json").write_text("{")
     with Operator(folder) as operator:
-        shown = operator.wait_for(lambda snapshot: len(errors(operator)) >= 6, 30)
+        shown = operator.wait_for(lambda snapshot: len(errors(operator)) >= 6, 60)
         assert shown is not None and shown.session is not None and not shown.read_failure
         session = shown.session
         assert [pose.name for pose in session.poses] == ["pose_01", "pose_02"]
@@ -100,7 +100,7 @@ def test_what_is_sound_is_shown_and_what_is_not_is_named(folder: Path) -> None:
         assert set(session.faults) <= set(errors(operator))
         shutil.rmtree(captures / "pose_01 (copy)")
         assert operator.choose_target("circles:7x5:20")
-        cleared = operator.wait_for(lambda s: s.session is not None and "(copy)" not in "\n".join(s.session.faults), 30)
+        cleared = operator.wait_for(lambda s: s.session is not None and "(copy)" not in "\n".join(s.session.faults), 60)
         assert cleared is not None
 
 
@@ -108,12 +108,12 @@ def test_the_page_shows_the_present_state_while_a_file_is_damaged(operator: Oper
     (folder / "decisions.json").write_text("{")
     assert not operator.choose_target("circles:7x5:20")
     operator.set_autopilot_status("going on")
-    failed = operator.wait_for(lambda snapshot: bool(snapshot.session and snapshot.session.faults), 30)
+    failed = operator.wait_for(lambda snapshot: bool(snapshot.session and snapshot.session.faults), 60)
     assert failed is not None and failed.session is not None
     assert "decisions.json" in failed.session.faults[0] and len(failed.session.scans) == 2
     (folder / "decisions.json").write_text(json.dumps({"names": {"scan_01": "a vase"}}))
     assert operator.choose_target("circles:7x5:20")
-    recovered = operator.wait_for(lambda snapshot: bool(snapshot.session and not snapshot.session.faults), 30)
+    recovered = operator.wait_for(lambda snapshot: bool(snapshot.session and not snapshot.session.faults), 60)
     assert recovered is not None and recovered.session is not None
     assert [scan.label for scan in recovered.session.scans] == ["a vase", "scan_02"]
 
@@ -124,7 +124,7 @@ def test_a_damaged_pose_is_refused_by_name(folder: Path) -> None:
     with Operator(folder) as operator:
         assert operator.choose_target("circles:7x5:20")
         operator.wait_until_idle(30)
-        shown = operator.wait_for(lambda s: bool(s.pose("pose_02")) and s.pose("pose_02").state == "refused", 30)  # type: ignore[union-attr]
+        shown = operator.wait_for(lambda s: bool(s.pose("pose_02")) and s.pose("pose_02").state == "refused", 60)  # type: ignore[union-attr]
         assert shown is not None
         assert "frame 2 of 4 is damaged" in shown.pose("pose_02").why  # type: ignore[union-attr]
 

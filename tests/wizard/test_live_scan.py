@@ -2,6 +2,7 @@
 
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -20,7 +21,7 @@ from slviewer.pipeline.models import load_stereo
 from slviewer.pipeline.simulate import save_true_stereo
 from slviewer.session.store import Session
 from slviewer.simulation.rig import letter
-from slviewer.wizard import acquisition
+from slviewer.wizard import acquisition, live_scan
 from slviewer.wizard.live_frames import Stream
 from slviewer.wizard.live_scan import LiveCloud, LiveModel
 from slviewer.wizard.operator import Operator
@@ -43,7 +44,7 @@ class Wizard:
         self.clouds: list[LiveCloud] = []
         self.operator = Operator(folder, RIG, set_up=self.rigs)
         self.operator.subscribe_live(self.clouds.append)
-        assert self.operator.wait_for(lambda s: s.rig.state == "open", 10)
+        assert self.operator.wait_for(lambda s: s.rig.state == "open", 60)
         self.operator.place("object")
 
     def goes_on(self, more: int = 3) -> None:
@@ -51,10 +52,10 @@ class Wizard:
         until(lambda: len(self.clouds) >= seen + more)
 
     def ends(self) -> None:
-        assert self.operator.wait_for(lambda s: s.live is None, 10)
+        assert self.operator.wait_for(lambda s: s.live is None, 60)
 
     def told(self, words: str) -> bool:
-        return self.operator.wait_for(lambda s: any(words in notice.text for notice in s.notices), 10) is not None
+        return self.operator.wait_for(lambda s: any(words in notice.text for notice in s.notices), 60) is not None
 
 
 def until(condition: Callable[[], bool], timeout_s: float = 60.0) -> None:
@@ -72,6 +73,15 @@ def wizard(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Wizard]:
     wizard.operator.close()
 
 
+def test_slow_clouds_have_a_rate_too() -> None:
+    times = deque([0.0, 10.0, 15.0, 20.0])
+    live_scan._drop_old(times, 21.0)
+    assert live_scan._compute_rate(times, 21.0) == pytest.approx(0.2)
+    live_scan._drop_old(times, 60.0)  # nothing came since
+    assert live_scan._compute_rate(times, 60.0) == pytest.approx(1 / 40)
+    assert live_scan._compute_rate(deque([0.0]), 1.0) == 0.0
+
+
 def test_clouds_stream_are_kept_and_give_way_to_a_capture(wizard: Wizard) -> None:
     operator = wizard.operator
     assert not operator.save_live() and wizard.told("no live scan runs")
@@ -79,7 +89,7 @@ def test_clouds_stream_are_kept_and_give_way_to_a_capture(wizard: Wizard) -> Non
     wizard.goes_on()
     for cloud in wizard.clouds:
         operator.count_live_shown(cloud)
-    live = operator.wait_for(lambda s: s.live is not None and s.live.shown_per_s > 0, 10)
+    live = operator.wait_for(lambda s: s.live is not None and s.live.shown_per_s > 0, 60)
     assert live is not None and live.live is not None
     assert live.live.points > 3000 and live.live.clouds_per_s > 0
     assert live.live.latency_ms is not None and live.live.latency_ms > 1
@@ -133,7 +143,7 @@ def test_a_fault_ends_it_with_a_sentence_and_what_was_kept_stays(wizard: Wizard)
     assert wizard.told("the camera does not answer")
     wizard.ends()
     assert wizard.told("the rig answers again")
-    assert operator.wait_for(lambda s: s.rig.state == "open", 10)
+    assert operator.wait_for(lambda s: s.rig.state == "open", 60)
     assert operator.session is not None and operator.session.capture_names() == ["scan_01"]
     assert operator.start_live()
     wizard.goes_on(1)

@@ -37,7 +37,7 @@ def operator(tmp_path: Path, rigs: FaultyRigs) -> Iterator[Operator]:
 
 
 def opened(operator: Operator) -> None:
-    assert operator.wait_for(lambda s: s.rig.state == "open", 10)
+    assert operator.wait_for(lambda s: s.rig.state == "open", 60)
 
 
 def last(snapshot: Snapshot) -> str:
@@ -119,7 +119,7 @@ def test_a_device_that_fails_leaves_no_half_capture(operator: Operator, rigs: Fa
     assert store is not None and operator.place_at_suggestion()
     rigs.faults.plan(fault, 12)
     assert operator.capture_pose()
-    failed = operator.wait_for(lambda s: any("answers again" in n.text for n in s.notices), 5)
+    failed = operator.wait_for(lambda s: any("answers again" in n.text for n in s.notices), 60)
     assert failed is not None and any("13 of 32" in n.text for n in failed.notices)
     assert store.capture_names() == [] and list((store.folder / "captures").iterdir()) == []
     opened(operator)
@@ -132,7 +132,7 @@ def test_a_capture_that_is_killed_leaves_every_earlier_pose(tmp_path: Path) -> N
 from slviewer.wizard.operator import Operator
 operator = Operator({str(tmp_path / "session")!r}, {RIG!r})
 operator.choose_target({TARGET!r})
-operator.wait_for(lambda s: s.rig.state == "open", 20)
+operator.wait_for(lambda s: s.rig.state == "open", 60)
 operator.place_at_suggestion()
 operator.capture_pose()
 operator.wait_until_idle()
@@ -161,7 +161,7 @@ def test_hands_free_captures_a_board_that_is_held_still(operator: Operator, monk
     operator.subscribe(lambda s: None, lambda p: counted.append(p.countdown_s) if p.countdown_s is not None else None)
     operator.place_at_suggestion()
     operator.set_hands_free(True)
-    found = operator.wait_for(lambda s: states(s).get("pose_01") == "good", 10)
+    found = operator.wait_for(lambda s: states(s).get("pose_01") == "good", 60)
     assert found is not None and found.hands_free and counted and all(0 < c <= 0.3 for c in counted)
     time.sleep(0.8)  # held there, it is not captured again
     assert operator.set_hands_free(False)

@@ -57,26 +57,26 @@ def test_a_suggested_exposure_is_set_and_can_be_undone(operator: Operator) -> No
     assert 0.7 < exposures[0] < 1.5  # at 1 ms the brightest reach the sensor's peak level
     assert change.suggestion.share > 0.95 and change.suggestion.share_before < 0.2
     assert session.exposures_ms == (exposures if len(exposures) > 1 else ())
-    assert operator.wait_for(lambda s: s.rig.exposure_ms == pytest.approx(exposures[0]), 5.0)
+    assert operator.wait_for(lambda s: s.rig.exposure_ms == pytest.approx(exposures[0]), 60)
     assert operator.capture_pose() and states(operator.wait_until_idle()) == {"pose_01": "good"}
     assert operator.suggest_exposure(for_scan=True) is False and "calibrate first" in last(operator.wait_until_idle())
     assert operator.undo_exposure()
     undone = operator.wait_until_idle()
     assert undone.exposure_change is None and undone.session is not None
     assert undone.session.exposures_ms == (20.0, 90.0)
-    assert operator.wait_for(lambda s: s.rig.exposure_ms == 20.0, 5.0)
+    assert operator.wait_for(lambda s: s.rig.exposure_ms == 20.0, 60)
 
 
 def test_a_rig_is_kept_under_a_name_with_its_exposure(operator: Operator) -> None:
     assert operator.set_exposure(2.5)
-    assert operator.wait_for(lambda s: s.rig.exposure_ms == 2.5, 5.0)
+    assert operator.wait_for(lambda s: s.rig.exposure_ms == 2.5, 60)
     assert operator.set_exposures((1.0, 8.0))
     assert operator.save_rig("mine", "With a longer exposure.")
     assert operator.session is not None
     assert load_rig("mine", operator.session) == {**RIG, "exposure_ms": 2.5, "gain": 1.0}
     assert operator.save_rig("../mine") is False and "cannot be a name" in last(operator.wait_until_idle())
     assert operator.choose_rig({**RIG, "exposure_ms": 1.5})
-    now = operator.wait_for(lambda s: s.rig.exposure_ms == 1.5, 5.0)
+    now = operator.wait_for(lambda s: s.rig.exposure_ms == 1.5, 60)
     assert now is not None and now.session is not None and now.session.exposures_ms == ()
 
 
@@ -102,10 +102,10 @@ def test_a_rig_chosen_once_more_keeps_what_was_measured_and_set(operator: Operat
 
 def test_what_a_check_finds_belongs_to_the_rig_that_was_checked(operator: Operator) -> None:
     assert operator.check_rig()
-    assert operator.wait_for(lambda s: s.rig.capture is not None and s.rig.capture.frame > 0, 10.0)
+    assert operator.wait_for(lambda s: s.rig.capture is not None and s.rig.capture.frame > 0, 60)
     other = {**RIG, "scale": 0.2}
     assert operator.choose_rig(other)
-    assert operator.wait_for(lambda s: s.rig.state == "open" and s.rig.choice == other, 10.0)
+    assert operator.wait_for(lambda s: s.rig.state == "open" and s.rig.choice == other, 60)
     after = operator.wait_until_idle()
     assert after.preflight is None and after.rig.choice == other and last(after) == "Checking the rig: cancelled"
 
@@ -124,7 +124,7 @@ def test_a_session_opens_without_the_rig_that_it_remembers(operator: Operator, t
     assert "Try again" in view.step("rig").problems[0]
     assert not operator.choose_rig(missing)  # as the button "Try this rig again" asks
     assert operator.session.decision("rig") == missing and operator.session.decision("exposure")["exposure_ms"] == 3.0
-    assert operator.choose_rig(RIG) and operator.wait_for(lambda s: s.rig.state == "open", 10.0)
+    assert operator.choose_rig(RIG) and operator.wait_for(lambda s: s.rig.state == "open", 60)
 
 
 def test_sessions_of_one_rig_have_exposures_of_their_own(operator: Operator, tmp_path: Path) -> None:
@@ -132,7 +132,7 @@ def test_sessions_of_one_rig_have_exposures_of_their_own(operator: Operator, tmp
         store.decide("rig", RIG)
         store.decide("exposure", {"exposure_ms": 3.0, "gain": 1.0})
     assert operator.open_session(tmp_path / "other")
-    assert operator.wait_for(lambda s: s.rig.exposure_ms == 3.0, 5.0)
+    assert operator.wait_for(lambda s: s.rig.exposure_ms == 3.0, 60)
 
 
 def test_an_open_session_can_be_opened_again_by_any_path_and_with_another_rig(
@@ -145,14 +145,14 @@ def test_an_open_session_can_be_opened_again_by_any_path_and_with_another_rig(
     assert operator.session is store
     assert operator.open_session(tmp_path / "link", {**RIG, "exposure_ms": 1.5})
     assert operator.session is store and store is not None and store.decision("rig")["exposure_ms"] == 1.5
-    assert operator.wait_for(lambda s: s.rig.exposure_ms == 1.5, 5.0)
+    assert operator.wait_for(lambda s: s.rig.exposure_ms == 1.5, 60)
 
 
 def test_a_recording_is_not_asked_for_light_that_it_does_not_hold(operator: Operator, tmp_path: Path) -> None:
     capture(tmp_path / "recorded", "a", RIG, patterns="p18")
-    assert operator.set_light("pattern") and operator.wait_for(lambda s: s.rig.light == "pattern", 5.0)
+    assert operator.set_light("pattern") and operator.wait_for(lambda s: s.rig.light == "pattern", 60)
     assert operator.choose_rig({"driver": "replay", "source": str(tmp_path / "recorded")})
-    now = operator.wait_for(lambda s: s.rig.name == "replay" and s.rig.state != "opening", 10.0)
+    now = operator.wait_for(lambda s: s.rig.name == "replay" and s.rig.state != "opening", 60)
     assert now is not None and now.rig.state == "open", now and now.rig.fault
     assert not operator.set_light("dark") and "no dark frame" in last(operator.wait_until_idle())
 

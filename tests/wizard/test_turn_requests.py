@@ -33,7 +33,7 @@ def operator(tmp_path: Path, rigs: FaultyRigs) -> Iterator[Operator]:
     with Session.create(tmp_path / "session") as store:
         save_true_stereo(store, rig)
     with Operator(tmp_path / "session", RIG, set_up=rigs) as operator:
-        assert operator.wait_for(lambda s: s.rig.state == "open", 20)
+        assert operator.wait_for(lambda s: s.rig.state == "open", 60)
         yield operator
 
 
@@ -82,5 +82,5 @@ def test_a_turn_that_fails_or_is_cancelled_is_resumed(operator: Operator, rigs: 
 
 def test_a_rig_without_a_turntable_says_so(operator: Operator) -> None:
     assert operator.choose_rig({"driver": "simulated", "scale": SCALE})
-    assert operator.wait_for(lambda s: s.rig.state == "open" and not s.rig.turntable, 20)
+    assert operator.wait_for(lambda s: s.rig.state == "open" and not s.rig.turntable, 60)
     assert not operator.scan_all_round() and "[turntable]" in operator.notices()[-1].text
