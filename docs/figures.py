@@ -113,13 +113,14 @@ def compute_edges(data: dict[str, Any]) -> dict[str, float]:
 def compute_surfaces(data: dict[str, Any]) -> dict[str, float]:
     """Return the numbers of the pages by name, from the JSON of ``prove --only surfaces``."""
     values = {}
-    for surface, sequences in data["surfaces"].items():
+    for surface, sequences in data["surfaces"]["surfaces"].items():
         for sequence, errors in sequences.items():
             values[f"surfaces {surface}; {sequence}"] = errors["rms_mm"]
         p18 = sequences["p18"]
         values[f"surfaces {surface}; ratio"] = p18["rms_mm"] / sequences["micro"]["rms_mm"]
         for name, share in (("masked", "gross_caught"), ("caught", "caught"), ("lost", "lost")):
-            values[f"surfaces {surface}; {name}"] = 100 * p18[share]
+            if p18[share] is not None:  # no point is wrong there
+                values[f"surfaces {surface}; {name}"] = 100 * p18[share]
     return values
 
 
