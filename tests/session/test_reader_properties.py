@@ -1,5 +1,6 @@
 """Laws of every reader of files: any bytes and any values give a typed value or one of our errors, nothing else."""
 
+import functools
 import html
 import json
 import shutil
@@ -267,6 +268,20 @@ def test_a_damaged_certificate_is_refused_or_typed(tmp_path: Path, data: st.Data
     _read(lambda: read_certificate(path))
 
 
+@functools.cache
+def _write_sound(kind: str) -> bytes:
+    """Return a sound file of this kind. Once: the one of 3MF states the time, and varies in its size by it."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, f"file.{kind}")
+        if kind in ("yml", "json"):
+            write_calibration(path, {"K": np.eye(3)})
+        elif kind == "step":
+            shutil.copy(Path(__file__).parent / "plate.step", path)
+        else:
+            trimesh.creation.box((10, 20, 30)).export(path)
+        return path.read_bytes()
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["yml", "json", "step", "3mf"])
 @settings(max_examples=5)
@@ -275,15 +290,6 @@ def test_a_damaged_file_that_another_process_parses_is_refused_or_read(
     tmp_path: Path, kind: str, data: st.DataObject
 ) -> None:
     path = tmp_path / f"file.{kind}"
-    if kind in ("yml", "json"):
-        write_calibration(path, {"K": np.eye(3)})
-        read: Callable[[Path], Any] = read_storage
-    else:
-        read = read_nominal
-        if kind == "step":
-            shutil.copy(Path(__file__).parent / "plate.step", path)
-        else:
-            trimesh.creation.box((10, 20, 30)).export(path)
-    sound = path.read_bytes()
-    path.write_bytes(data.draw(_damaged_bytes(sound)))
+    read: Callable[[Path], Any] = read_storage if kind in ("yml", "json") else read_nominal
+    path.write_bytes(data.draw(_damaged_bytes(_write_sound(kind))))
     _read(lambda: read(path))
