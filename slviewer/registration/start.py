@@ -21,10 +21,9 @@ SEARCHED: tuple[Start, ...] = ("features", "centroids")
 _TRIPLETS = 60_000
 _SEED = 0
 _CANDIDATES = 6
-_COARSE_POINTS = 2000
-"""Of a scan in the coarse ICP, or up to twice as many. A scan thinned to a fortieth of the size has fewer; more
-where the scan is much larger than the reference."""
 _LEAST_VOTES = 0.15  # of those for the best pose
+_COARSE_POINTS = 2000
+"""Of a scan in the coarse ICP, or up to twice as many: only scans much larger than the reference have more."""
 
 
 @dataclass(frozen=True)
@@ -58,12 +57,12 @@ def rank_starts(
     tried = candidates(scanned, referred, voxel) if initial is None else iter([initial])
     scan, reference = scanned.thinned(voxel), referred.thinned(voxel)
     tree = cKDTree(np.asarray(reference.points))
-    moved = scan.uniform_down_sample(max(1, len(scan.points) // _COARSE_POINTS))
+    sparse_scan = scan.uniform_down_sample(max(1, len(scan.points) // _COARSE_POINTS))
     found: list[Candidate] = []
     for candidate in tried:
         T = candidate.T
         for gate in (6.0 * voxel, 3.0 * voxel, 1.5 * voxel):
-            T = align_icp(moved, reference, T, gate, open3d().pipelines.registration.L2Loss(), 1e-5, 20)
+            T = align_icp(sparse_scan, reference, T, gate, open3d().pipelines.registration.L2Loss(), 1e-5, 20)
         if all(pose_distance(np.asarray(scan.points), T, other.T) > 0.5 * voxel for other in found):
             found.append(Candidate(T, candidate.start, _score_pose(scan, reference, tree, T, voxel)))
     return sorted(found, key=lambda candidate: -candidate.score)

@@ -269,8 +269,8 @@ def test_a_damaged_certificate_is_refused_or_typed(tmp_path: Path, data: st.Data
 
 
 @functools.cache
-def _write_sound(kind: str) -> bytes:
-    """Return a sound file of this kind. Once: the one of 3MF states the time, and varies in its size by it."""
+def _make_sound_file(kind: str) -> bytes:
+    """Return a sound file of this kind; cached, because a 3MF file holds random UUIDs and varies in size."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, f"file.{kind}")
         if kind in ("yml", "json"):
@@ -291,5 +291,5 @@ def test_a_damaged_file_that_another_process_parses_is_refused_or_read(
 ) -> None:
     path = tmp_path / f"file.{kind}"
     read: Callable[[Path], Any] = read_storage if kind in ("yml", "json") else read_nominal
-    path.write_bytes(data.draw(_damaged_bytes(_write_sound(kind))))
+    path.write_bytes(data.draw(_damaged_bytes(_make_sound_file(kind))))
     _read(lambda: read(path))
