@@ -9,12 +9,15 @@ if "PYTEST_XDIST_WORKER" in os.environ:
         os.environ.setdefault(f"{library}_NUM_THREADS", "1")
 
 import json
-from collections.abc import Callable, Iterator
+import subprocess
+import time
+from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
 
 import pytest
 from chromium import launched
 from filelock import FileLock
+from numba.core import event
 from playwright.sync_api import Browser, sync_playwright
 
 os.environ["SLVIEWER_NO_PREPARATION"] = "1"  # wizards that tests start compile what they use, and nothing beside it
@@ -22,18 +25,61 @@ sys.dont_write_bytecode = False  # what tests start as processes need not compil
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 
+NEEDS = ("browser", "process", "computes", "slow")
+"""What a test may need; one that needs none of these is quick."""
+MAX_QUICK_COMPILE_S = 3.0
+"""Processor seconds that a quick test may spend in the compiler of kernels."""
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark what the shared fixtures make heavy, and put long files first: both workers end at about the same time."""
+    """Mark what the shared fixtures need, and put heavy files first: both workers end at about the same time."""
     weight: dict[Path, int] = {}
     for item in items:
         fixtures = getattr(item, "fixturenames", ())
         if "browser" in fixtures:
             item.add_marker(pytest.mark.browser)
         if "recorded" in fixtures:
-            item.add_marker(pytest.mark.slow)
-        heavy = sum(item.get_closest_marker(name) is not None for name in ("browser", "slow"))
-        weight[item.path] = max(weight.get(item.path, 0), heavy)
+            item.add_marker(pytest.mark.computes)
+        needs = sum(item.get_closest_marker(name) is not None for name in NEEDS)
+        if not needs:
+            item.add_marker(pytest.mark.quick)
+        weight[item.path] = max(weight.get(item.path, 0), needs)
     items.sort(key=lambda item: -weight[item.path])
+
+
+class CompilerTime(event.Listener):
+    """Processor seconds that this thread has spent compiling kernels."""
+
+    def __init__(self) -> None:
+        self.seconds, self._depth, self._start = 0.0, 0, 0.0
+
+    def on_start(self, event: event.Event) -> None:
+        if self._depth == 0:
+            self._start = time.thread_time()
+        self._depth += 1
+
+    def on_end(self, event: event.Event) -> None:
+        self._depth -= 1
+        if self._depth == 0:
+            self.seconds += time.thread_time() - self._start
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call(item: pytest.Item) -> Generator[None, object, object]:
+    """Fail a quick test that starts a process or compiles for long: it is to be marked with what it needs."""
+    if item.get_closest_marker("quick") is None:
+        return (yield)
+
+    def refuse(*arguments: object, **options: object) -> None:
+        pytest.fail("a quick test starts a process: mark it with `process`", pytrace=False)
+
+    compiler = CompilerTime()
+    with pytest.MonkeyPatch.context() as patch, event.install_listener("numba:compile", compiler):
+        patch.setattr(subprocess.Popen, "__init__", refuse)
+        result = yield
+    if compiler.seconds > MAX_QUICK_COMPILE_S:
+        pytest.fail(f"a quick test compiles for {compiler.seconds:.1f} s: mark it with `computes`", pytrace=False)
+    return result
 
 
 @pytest.fixture(scope="session", autouse=True)

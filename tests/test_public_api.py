@@ -12,7 +12,7 @@ from slviewer.session.toml import describe_sequence
 from slviewer.simulation.rig import letter
 from slviewer.validation.hostile_captures import BOARD, HostileBench, write_images
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.computes
 
 EXAMPLES = Path(__file__).parents[1] / "docs" / "examples"
 

@@ -17,7 +17,7 @@ from slviewer.records import from_plain, to_plain
 from slviewer.simulation.boards import Pose
 from slviewer.simulation.rig import letter
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.computes
 
 RIG = letter(0.5, seed=3)
 FEW = 6  # later poses where a movement is looked for: it is seen in every one

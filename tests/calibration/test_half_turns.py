@@ -14,7 +14,7 @@ from slviewer.calibration.stereo import calibrate_stereo
 from slviewer.simulation.boards import BoardShape
 from slviewer.target.board import Board
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.computes
 
 __all__ = ["coarse_knots"]  # a fixture for every test here
 

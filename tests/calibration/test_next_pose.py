@@ -32,7 +32,7 @@ def follow(n: int, illuminated=everywhere) -> list[np.ndarray]:
     return poses
 
 
-@pytest.mark.slow
+@pytest.mark.computes
 def test_suggestions_close_every_gap_and_stay_in_view():
     poses = follow(12)
     found = coverage(BOARD, LENS, poses)
@@ -47,7 +47,7 @@ def test_suggestions_close_every_gap_and_stay_in_view():
     assert shares[0] == 0 and np.diff(shares).min() >= 0
 
 
-@pytest.mark.slow
+@pytest.mark.computes
 def test_words_say_what_the_pose_is():
     words = {"facing": "squarely", **{tilt: f"Tilt the {tilt.split()[0]} away" for tilt in TILTS[1:]}}
     seen = set()

@@ -39,7 +39,7 @@ def cloud_offsets(splined: SplinedModel, true, lens: Lens) -> np.ndarray:
     return np.asarray(np.linalg.norm(lens.project(points[v, u].astype(float)) - np.column_stack([u, v]), axis=1))
 
 
-@pytest.mark.slow
+@pytest.mark.computes
 def test_the_fit_reproduces_the_clouds_pixels(models, true) -> None:
     _, splined = models
     camera, projector = fit_splined(splined)
@@ -50,7 +50,7 @@ def test_the_fit_reproduces_the_clouds_pixels(models, true) -> None:
     assert 0.0 < projector.rms_px < 0.1 and 0.2 < projector.share < 1.0
 
 
-@pytest.mark.slow
+@pytest.mark.computes
 def test_what_a_lens_cannot_express_is_stated() -> None:
     _, splined = _bent()
     camera, _ = fit_splined(splined)

@@ -14,7 +14,7 @@ from slviewer.calibration.stereo import StereoModel, calibrate_stereo
 from slviewer.errors import InputError
 from slviewer.simulation.boards import BoardShape, printed_board
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.computes
 
 SHAPE = BoardShape(bow_x_mm=0.1, bow_y_mm=-0.04, twist_mm=0.05, misplaced_mm=0.02)
 DEPTHS = (440.0, 520.0, 600.0, 690.0, 780.0)

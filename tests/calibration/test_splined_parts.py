@@ -53,7 +53,7 @@ def bent(state: State, rng: np.random.Generator) -> State:
     return state.step(step)
 
 
-@pytest.mark.slow
+@pytest.mark.computes
 def test_every_derivative_agrees_with_differences(seen, stereo) -> None:
     rng = np.random.default_rng(0)
     few = [type(o)(**{**vars(o), "samples": _every(o.samples, 30)}) for o in seen[:3]]
@@ -125,7 +125,7 @@ def test_a_displacement_and_its_inverse(true) -> None:
     assert np.isclose(constant @ form @ constant, 0.05 * len(form)) and np.linalg.eigvalsh(form)[0] > 0
 
 
-@pytest.mark.slow
+@pytest.mark.computes
 def test_the_compiled_form_is_the_exact_one(model, true) -> None:
     state = model.rig
     camera, projector = pinhole_lens(state.camera), pinhole_lens(state.projector)

@@ -13,7 +13,7 @@ from slviewer.session.exporters import write_calibration
 from slviewer.session.ply import read_ply
 from slviewer.session.store import Session
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.computes
 
 Run = Callable[..., tuple[int, str, str]]
 

@@ -36,7 +36,7 @@ class BlindCamera(Openable):
         return self.settings()
 
 
-@pytest.mark.slow
+@pytest.mark.computes
 def test_a_sound_rig(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with Session.create(tmp_path / "session") as store:
         save_rig(store, "small", {"driver": "simulated", "scale": 0.25, "exposure_ms": 0.9})

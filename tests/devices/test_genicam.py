@@ -92,7 +92,7 @@ def test_producers_that_are_missing_or_broken_are_named(monkeypatch, tmp_path):
             list_connected()
 
 
-@pytest.mark.slow
+@pytest.mark.computes
 def test_a_hundred_frames_fill_the_array_they_are_given(camera):
     fast(camera)
     frames = np.zeros((100, 400, 400), np.uint8)

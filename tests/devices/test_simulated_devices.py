@@ -137,7 +137,7 @@ def test_gain_brings_light_and_noise(world, rig):
     assert 2.5 < spread[8.0] / spread[1.0] < 5  # shot noise alone gives sqrt(8)
 
 
-@pytest.mark.slow
+@pytest.mark.computes
 def test_moving_the_board_changes_the_next_frame(world, rig):
     rig.projector.show_level(255)
     poses = target_poses(world.rig, world.board, 3)
@@ -149,7 +149,7 @@ def test_moving_the_board_changes_the_next_frame(world, rig):
         assert np.array_equal(world.pose.t, pose.t)
 
 
-@pytest.mark.slow
+@pytest.mark.computes
 def test_a_draft_shows_the_board_where_it_is_and_captures_are_never_drafts(monkeypatch):
     monkeypatch.setattr(world_module, "_SETTLED_S", 1e9)
     world = SimulatedWorld(letter(0.5))
@@ -201,7 +201,7 @@ def test_an_empty_view_is_dark_and_no_error(world, rig):
     assert seen(rig).max() < 15
 
 
-@pytest.mark.slow
+@pytest.mark.computes
 def test_the_board_may_move_in_another_thread_during_a_capture(world, rig):
     poses = target_poses(world.rig, world.board, 5)
     stop = threading.Event()

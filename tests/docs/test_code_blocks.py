@@ -126,7 +126,7 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.slow
+@pytest.mark.computes
 @pytest.mark.parametrize("page", pages_with("bash"), ids=name_of)
 def test_the_commands_of_a_page_run(page: Path, workspace: Path, tmp_path: Path, monkeypatch) -> None:
     shutil.copytree(workspace, tmp_path / "work")
@@ -142,7 +142,7 @@ def test_the_commands_of_a_page_run(page: Path, workspace: Path, tmp_path: Path,
                 run(line)
 
 
-@pytest.mark.slow
+@pytest.mark.computes
 @pytest.mark.parametrize("page", pages_with("python"), ids=name_of)
 def test_the_python_of_a_page_runs(page: Path, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)

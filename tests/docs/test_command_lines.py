@@ -31,7 +31,7 @@ def command_lines(page: Path) -> list[str]:
     return [line for line in lines if line.startswith("slviewer ")]
 
 
-@pytest.mark.slow
+@pytest.mark.computes
 @pytest.mark.parametrize("page", [p for p in PAGES if command_lines(p)], ids=lambda page: str(page.relative_to(ROOT)))
 def test_the_commands_of_a_page_exist_with_their_options(page: Path) -> None:
     for line in command_lines(page):

@@ -13,7 +13,7 @@ from slviewer.fringe.patterns import render
 from slviewer.fringe.presets import phase_steps
 from slviewer.fringe.sequence import PatternSequence
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.computes
 
 ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "docs" / "examples" / "slviewer-example-plugin"

@@ -13,7 +13,7 @@ EXAMPLES = DOCS / "examples"
 SCRIPTS = ("batch_dask.py", "compare_models.py", "decode_and_look.py", "merge_and_mesh.py", "sphere_diameter.py")
 """Those that take a picture's path; tests/test_public_api.py runs the others."""
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.computes
 
 
 @pytest.mark.parametrize("script", SCRIPTS)

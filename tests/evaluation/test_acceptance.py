@@ -81,7 +81,7 @@ def true_test(bars):
     return outcome(Artefact.from_dict(GIVEN), bars, true_model())
 
 
-@pytest.mark.slow
+@pytest.mark.computes
 def test_the_true_rig_measures_a_ball_bar_to_its_noise(true_test):
     for position in true_test.positions:
         spacing, size, form = (position.error(name) for name in (SPACING, SIZE, FORM))
@@ -98,7 +98,7 @@ def test_the_true_rig_measures_a_ball_bar_to_its_noise(true_test):
     assert [p.incidence["R1"] for p in true_test.positions].count(100.0) == 1
 
 
-@pytest.mark.slow
+@pytest.mark.computes
 def test_a_scale_error_of_200_ppm_is_found(bars, true_test):
     wrong = outcome(Artefact.from_dict(GIVEN), bars, true_model(200e-6))
     assert wrong.scale.ppm == pytest.approx(200, abs=wrong.scale.U_ppm)
@@ -128,7 +128,7 @@ def test_decisions_heed_the_tests_own_uncertainty(true_test, limit, decision):
     assert "claims conformity with neither" in judged.text()
 
 
-@pytest.mark.slow
+@pytest.mark.computes
 def test_planes_are_flat_to_their_noise():
     artefact = Artefact.from_dict(tomllib.loads((EXAMPLES / "plane.toml").read_text()))
     found = []

@@ -17,7 +17,7 @@ from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import letter
 from slviewer.target.board import Board
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.computes
 
 PROJECTOR = (512, 400)
 TRUTH = slope(240, 320)

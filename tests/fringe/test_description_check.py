@@ -22,7 +22,7 @@ from slviewer.fringe.presets import AXES, bits_for, complementary, gray, gray_bi
 from slviewer.fringe.sequence import Frame, PatternSequence, PerAxis
 from slviewer.simulation.rig import letter
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.computes
 
 PROJECTOR = (912, 1140)
 Capture = tuple[PatternSequence, np.ndarray]

@@ -10,7 +10,7 @@ from slviewer.fringe.phase import Reason
 from slviewer.fringe.presets import complementary, gray, p18
 from slviewer.fringe.sequence import PatternSequence
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.computes
 
 PROJECTOR = (256, 128)
 TRUTH = slope(240, 320, per_px=0.5, start=20.0)

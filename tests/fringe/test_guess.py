@@ -29,7 +29,7 @@ from slviewer.fringe.sequence import Frame, PatternSequence
 from slviewer.session.importers.frames import read_description
 from slviewer.simulation.rig import letter
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.computes
 
 PROJECTOR = (912, 1140)
 

@@ -79,7 +79,7 @@ def test_a_real_scene_of_another_tool(david):
         estimate_gray_origin(replace(sequence, phase_sign=-1), frames, "x")
 
 
-@pytest.mark.slow
+@pytest.mark.computes
 def test_real_gray_code_with_inverses(real_data):
     sequence = gray((1024, 768))
     folder = real_data / "kamino_procam_jpg90" / "capture_0"

@@ -17,7 +17,7 @@ from slviewer.simulation.boards import Pose, blank_board
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import letter
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.computes
 
 PROJECTOR = (256, 128)
 COORDINATE = slope(start=20.0)

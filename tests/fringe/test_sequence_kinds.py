@@ -12,7 +12,7 @@ from slviewer.fringe.phase import Reason
 from slviewer.fringe.presets import bits_for, complementary, gray, gray_bits, multifrequency, p18, phase_steps
 from slviewer.fringe.sequence import Frame, PatternSequence, PerAxis
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.computes
 
 SIZE = (500, 500)
 INNER = np.s_[:, 5:-5]  # the simulated lens blur repeats the image's border

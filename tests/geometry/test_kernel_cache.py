@@ -56,7 +56,7 @@ def read_only(install: Path) -> None:
     (install / "slviewer" / "__pycache__").touch()
 
 
-@pytest.mark.slow
+@pytest.mark.computes
 def test_another_files_change_is_seen_and_code_is_compiled_once(install: Path, tmp_path: Path) -> None:
     home = {"HOME": str(tmp_path / "home")}
     value, hits, place = run(install, "import slviewer.caller", **home)
@@ -69,7 +69,7 @@ def test_another_files_change_is_seen_and_code_is_compiled_once(install: Path, t
     assert (value, hits) == ("10", "1")
 
 
-@pytest.mark.slow
+@pytest.mark.computes
 def test_of_two_processes_one_compiles_and_the_other_waits_and_loads(install: Path) -> None:
     with ThreadPoolExecutor(2) as both:
         results = [*both.map(lambda _: run(install, "import slviewer.caller"), range(2))]

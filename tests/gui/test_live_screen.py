@@ -17,7 +17,7 @@ from slviewer.validation import bench_live as rate
 from slviewer.validation.bench_live import true_calibration
 from slviewer.wizard.operator import Operator
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.computes
 
 SCALE = 0.15
 COMPILED_MS = 240_000

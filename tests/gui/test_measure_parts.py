@@ -82,7 +82,7 @@ def test_what_is_drawn_lies_where_it_was_measured() -> None:
     assert np.allclose(segments[:-1, :, 2], CENTRE[2] - 0.15)
 
 
-@pytest.mark.slow
+@pytest.mark.computes
 def test_a_section_is_read_off_at_its_cursors() -> None:
     plane = CutPlane.through(np.array([0.0, 0, 500]), np.array([100.0, 0, 500]), np.array([0.0, 0, -1]))
     t = np.linspace(0, np.pi, 721)

@@ -47,7 +47,7 @@ def found(ammonite) -> Deviation:
     return deviation(noisy(points)[seen], nominal, normals=normals[seen], sigma_mm=NOISE)
 
 
-@pytest.mark.slow
+@pytest.mark.computes
 def test_the_simulated_object_deviates_from_its_own_mesh_by_its_noise(found, ammonite) -> None:
     _, _, points, normals = ammonite
     seen = np.isfinite(points[..., 0])
@@ -71,7 +71,7 @@ def test_the_best_fit_lies_within_microns_of_the_truth(found) -> None:
     assert found.alignment_mm < 0.005
 
 
-@pytest.mark.slow
+@pytest.mark.computes
 def test_a_table_is_left_out_and_told(ammonite, found) -> None:
     _, nominal, points, normals = ammonite
     seen = np.isfinite(points[..., 0])
@@ -127,7 +127,7 @@ def test_a_bump_of_a_tenth_is_seen_within_5_microns() -> None:
     assert judge_deviation(found, np.full(len(points), 0.01), verdict.highest[0]).decision == "undecided"
 
 
-@pytest.mark.slow
+@pytest.mark.computes
 def test_a_part_that_looks_alike_from_two_sides_is_placed_on_either(monkeypatch) -> None:
     monkeypatch.setattr(placing, "VIEWS", placing.VIEWS[-2:])  # corners; a box has no front
     box = trimesh.creation.box((60, 40, 20))

@@ -27,7 +27,7 @@ from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import letter
 from slviewer.target.board import Board
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.computes
 
 SPHERES, PLANES = ("sphere_1", "sphere_3"), ("plane_03", "plane_04", "plane_05")
 

@@ -18,7 +18,7 @@ from slviewer.session.store import Session
 from slviewer.simulation.rig import letter
 from slviewer.validation.faulty_captures import BOARD, FaultBench
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.computes
 
 Run = Callable[..., tuple[int, str, str]]
 POSES = 7

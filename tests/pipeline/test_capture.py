@@ -38,7 +38,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.slow
+@pytest.mark.computes
 def test_what_the_file_and_the_command_say_is_what_is_kept(folder: Path):
     with Session.open(folder / "session") as store:
         one, three = store.captures("calibration")
@@ -84,7 +84,7 @@ def test_a_recording_is_captured_again_to_the_last_bit(folder: Path, run: Run, t
     assert status == 1 and error
 
 
-@pytest.mark.slow
+@pytest.mark.computes
 def test_patterns_names_and_force(folder: Path, run: Run, tmp_path: Path):
     begin = ("capture", tmp_path / "session", "a", "--rig", folder / "rig.toml")
     assert run(*begin, "--patterns", "p18", "--exposure-ms", 0.5)[0] == 0

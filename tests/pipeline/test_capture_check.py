@@ -25,13 +25,13 @@ def frames() -> np.ndarray:
     return Renderer(letter(0.15), plate).capture(SEQUENCE)
 
 
-@pytest.mark.slow
+@pytest.mark.computes
 def test_a_sound_capture_passes(frames: np.ndarray) -> None:
     check_capture("pose_01", SEQUENCE, frames, decode_frames("pose_01", SEQUENCE, frames))
     assert check_frames(SEQUENCE, frames).warnings() == []
 
 
-@pytest.mark.slow
+@pytest.mark.computes
 def test_the_most_probable_contradiction_is_the_reason(frames: np.ndarray) -> None:
     wrong = replace(SEQUENCE, gray_origin_px=8.5)
     with pytest.raises(InputError, match=r"pose_01: .*gray_origin = -0\.[45]\d* .*phase_offset = -?3\.1\d"):

@@ -19,7 +19,7 @@ from slviewer.pipeline.report import report
 from slviewer.report.page import CERTIFICATE, split_page
 from slviewer.session.store import Session
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.computes
 
 
 @pytest.fixture(scope="module")

@@ -25,7 +25,7 @@ from slviewer.simulation.rig import letter
 from slviewer.simulation.scenes import Spheres
 from slviewer.target.board import Board
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.computes
 
 BOARD = Board.parse("circles:21x16:9")
 ARTEFACT = """

@@ -19,7 +19,7 @@ from slviewer.pipeline.capture_phases import decode_capture
 from slviewer.session.store import Session
 from slviewer.simulation.rig import letter
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.computes
 
 Run = Callable[..., tuple[int, str, str]]
 

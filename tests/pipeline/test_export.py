@@ -165,7 +165,7 @@ def test_poses_chain(kept: Path, tmp_path: Path) -> None:
     storage.release()
 
 
-@pytest.mark.slow
+@pytest.mark.computes
 def test_coefficients_say_how_they_are_used(kept: Path, tmp_path: Path) -> None:
     path = export(kept, "coefficients", out=tmp_path / "k.npz").path
     held, model = np.load(path), pixelwise()

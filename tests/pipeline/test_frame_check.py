@@ -14,7 +14,7 @@ from slviewer.pipeline.frame_check import FrameCheck, check_frames, load_check, 
 from slviewer.session.store import Session
 from slviewer.simulation.rig import letter
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.computes
 
 
 def taken(sequence_of=p18, gamma=1.0, thing="board", seed=0, **wrong):

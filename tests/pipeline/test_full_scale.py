@@ -69,7 +69,7 @@ def captured(folder: Path, share: float, full_scale: int = 4095) -> list[str]:
     return warnings
 
 
-@pytest.mark.slow
+@pytest.mark.computes
 def test_a_dark_capture_is_dark_everywhere(tmp_path: Path) -> None:
     folder = tmp_path / "session"
     warnings = captured(folder, DARK)
@@ -100,7 +100,7 @@ def test_a_dark_capture_is_dark_everywhere(tmp_path: Path) -> None:
     assert check_capture_exposure(old, frames, phases).figures["bright_share_of_full_scale"] > 0.5
 
 
-@pytest.mark.slow
+@pytest.mark.computes
 def test_the_rig_is_judged_by_its_full_scale() -> None:
     rig = deep_rig(DARK)
     with rig.opened():
@@ -108,7 +108,7 @@ def test_the_rig_is_judged_by_its_full_scale() -> None:
     assert exposure.verdict == "bad" and 0.03 < exposure.figures["bright_share_of_full_scale"] < 0.05
 
 
-@pytest.mark.slow
+@pytest.mark.computes
 @pytest.mark.parametrize("full_scale", [4000, 4095])
 def test_pixels_at_the_full_scale_are_saturated(tmp_path: Path, full_scale: int) -> None:
     folder = tmp_path / "session"

@@ -13,7 +13,7 @@ from slviewer.geometry.rig import StereoRig
 from slviewer.session.exporters import write_calibration
 from slviewer.session.store import Session
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.computes
 
 Run = Callable[..., tuple[int, str, str]]
 CAMERA, PROJECTOR = (160, 120), (456, 570)

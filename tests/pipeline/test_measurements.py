@@ -29,7 +29,7 @@ from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import letter
 from slviewer.simulation.scenes import Spheres
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.computes
 
 Run = Callable[..., tuple[int, str, str]]
 CENTRES = np.array([[-38.0, 0.0, 560.0], [42.0, 6.0, 570.0]])

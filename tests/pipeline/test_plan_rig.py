@@ -10,7 +10,7 @@ from slviewer.errors import InputError
 from slviewer.evaluation.rig_plan import plan_rig as predict
 from slviewer.pipeline.plan_rig import _read_camera, _read_projector, plan_rig
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.computes
 
 BUDGETS = (
     ("webcam-1080p", "pocket-720p", 500.0),

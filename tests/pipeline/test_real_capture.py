@@ -9,7 +9,7 @@ import trimesh
 
 from slviewer.cli import main
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.computes
 
 
 @pytest.fixture(scope="module")

@@ -16,7 +16,7 @@ from slviewer.simulation.boards import FLAT, BoardScene, Pose
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import letter
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.computes
 
 Run = Callable[..., tuple[int, str, str]]
 RIG = letter(0.25, 3, local_distortion_px=0.0)

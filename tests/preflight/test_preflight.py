@@ -18,7 +18,7 @@ from slviewer.preflight.check_rig import check_rig, preflight
 from slviewer.simulation.boards import Pose
 from slviewer.simulation.rig import letter
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.computes
 
 SCALE = 0.2
 

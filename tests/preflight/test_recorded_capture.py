@@ -19,7 +19,7 @@ from slviewer.preflight.check_rig import check_capture
 from slviewer.session.store import Session
 from slviewer.simulation.rig import letter
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.computes
 
 Change = Callable[[np.ndarray], np.ndarray]
 

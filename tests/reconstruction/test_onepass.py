@@ -15,7 +15,7 @@ from slviewer.fringe.presets import complementary, gray, multifrequency, p18
 from slviewer.fringe.reference import decode_reference
 from slviewer.reconstruction.onepass import OnePass
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.computes
 
 PROJECTOR = (912, 1140)
 HEIGHT, WIDTH = 61, 150

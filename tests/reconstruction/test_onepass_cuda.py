@@ -29,7 +29,7 @@ from slviewer.reconstruction.onepass import OnePass
 from slviewer.reconstruction.onepass_cuda import CudaPass, has_pass, one_pass
 from slviewer.validation import bench_rows
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.computes
 
 ROOT = Path(__file__).parents[2]
 PROJECTOR = (912, 1140)

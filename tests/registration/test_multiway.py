@@ -14,7 +14,7 @@ from slviewer.registration.multiway import Alignment, Scan, Starts, register_all
 from slviewer.registration.refusal import Refused
 from slviewer.registration.turntable import TurntableAxis, fit_turntable_axis
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.computes
 
 DEPTHS = {"object_r1": -120.0, "object_r2": 0.0, "object_r3": 120.0}
 

@@ -10,14 +10,14 @@ def run(code: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=False)
 
 
-@pytest.mark.slow
+@pytest.mark.computes
 def test_open3d_imports_in_a_fresh_process() -> None:
     done = run("from slviewer.registration.open3d_loader import open3d; print(open3d().geometry.PointCloud.__name__)")
     assert done.returncode == 0, done.stderr
     assert done.stdout.strip() == "PointCloud"
 
 
-@pytest.mark.slow
+@pytest.mark.computes
 def test_open3d_imports_without_dash() -> None:
     code = "from slviewer.registration.open3d_loader import open3d; import sys; open3d(); print('dash' in sys.modules)"
     done = run(code)
@@ -39,7 +39,7 @@ def test_a_missing_open3d_names_the_remedy() -> None:
     assert "pip install open3d" in done.stdout, done.stderr
 
 
-@pytest.mark.slow
+@pytest.mark.computes
 def test_a_break_while_open3d_is_imported_waits_for_its_end() -> None:
     done = run(
         "import os, signal, threading, time\n"

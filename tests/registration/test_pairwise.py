@@ -9,7 +9,7 @@ from slviewer.registration.pairwise import register
 from slviewer.registration.picked import fit_picked_start
 from slviewer.registration.refusal import Refused
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.computes
 
 
 @pytest.mark.parametrize(("deg", "mm"), [(1.0, 2.0), (60.0, 150.0)])

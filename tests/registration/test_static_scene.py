@@ -17,7 +17,7 @@ from slviewer.simulation.mesh import MeshScene
 from slviewer.simulation.scenes import Surface
 from slviewer.simulation.turning import AXIS, AXIS_POINT, turning
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.computes
 
 NOISE = 0.04
 SIZE = (220, 165)

@@ -20,7 +20,7 @@ from slviewer.report.page import Figure
 from slviewer.report.reprojection import coverage, pose_bars, residual_arrows
 from slviewer.report.space import planes_in_space
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.computes
 
 RMS = {"stereo": 0.2, "pixelwise": 0.08}
 

@@ -23,7 +23,7 @@ from slviewer.report.reproduction import (
 from slviewer.report.session import session_headlines, session_sections, session_title
 from slviewer.report.tables import better_worse, compare_errors, format_number, plane_table, spacing_table, sphere_table
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.computes
 
 WIDTH = 240
 

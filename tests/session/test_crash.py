@@ -36,7 +36,7 @@ with Session.open(folder, write=True) as session:
 """
 
 
-@pytest.mark.slow
+@pytest.mark.computes
 def test_a_writer_killed_at_any_moment_leaves_whole_captures(tmp_path, sequence, frames):
     folder = tmp_path / "session"
     with Session.create(folder) as session:

@@ -282,7 +282,7 @@ def _make_sound_file(kind: str) -> bytes:
         return path.read_bytes()
 
 
-@pytest.mark.slow
+@pytest.mark.computes
 @pytest.mark.parametrize("kind", ["yml", "json", "step", "3mf"])
 @settings(max_examples=5)
 @given(data=st.data())

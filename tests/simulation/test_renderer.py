@@ -97,7 +97,7 @@ def test_the_seed_alone_decides_the_frames():
     assert not np.array_equal(first[0], first[1])
 
 
-@pytest.mark.slow
+@pytest.mark.computes
 def test_circles_are_seen_where_they_are():
     rig = letter(0.5)
     board = Board.parse("circles:21x16:9")
@@ -135,7 +135,7 @@ def test_defocus_takes_modulation_and_leaves_phase():
     assert soft_B / sharp == pytest.approx(np.exp(-2 * (np.pi / 18) ** 2 * (sigma[1] ** 2 - sigma[0] ** 2)), rel=0.03)
 
 
-@pytest.mark.slow
+@pytest.mark.computes
 def test_gamma_bends_the_fringes_and_flicker_shakes_them():
     scene = blank_board(FACING, (400, 300))
     straight, bent = (shift(Renderer(letter(0.25, gamma=g), scene).capture(PHASE_X))[1].mean() for g in (1.0, 2.2))

@@ -16,7 +16,7 @@ from slviewer.surface.tools import select_faces
 from slviewer.surface.topology import analyse_topology
 from slviewer.surface.volume import volume_surface
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.computes
 
 VOLUME = 4 / 3 * np.pi * RADIUS**3
 

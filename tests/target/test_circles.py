@@ -12,7 +12,7 @@ from slviewer.target.board import Board
 from slviewer.target.detect import board_mask, detect
 from slviewer.target.numbering import x_direction
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.computes
 
 BOARD = Board.parse("circles:9x7:20")
 SMALL = View(size=(400, 300), supersample=4)

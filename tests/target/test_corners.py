@@ -11,7 +11,7 @@ from slviewer.target.board import Board
 from slviewer.target.detect import board_mask, detect
 from slviewer.target.numbering import check_grid
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.computes
 
 SMALL = View(size=(400, 300), supersample=4)
 CHESSBOARD = Board.parse("chessboard:9x7:20")

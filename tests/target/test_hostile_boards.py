@@ -12,7 +12,7 @@ from slviewer.errors import DetectionError
 from slviewer.target.board import Board
 from slviewer.target.detect import detect
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.computes
 
 SYMMETRIC, ASYMMETRIC = Board.parse("circles:9x7:20"), Board.parse("acircles:4x11:20")
 SIZE = (400, 300)

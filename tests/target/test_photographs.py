@@ -11,7 +11,7 @@ from slviewer.errors import DetectionError
 from slviewer.target.board import Board
 from slviewer.target.detect import board_mask, detect
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.computes
 
 ASYMMETRIC = ("acircles:7x13:10", "acircles:5x5:10", "acircles:3x9:10")
 PHOTOGRAPHS = [("circles", k, "circles:7x7:10") for k in range(1, 15)]

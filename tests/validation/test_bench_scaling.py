@@ -28,7 +28,7 @@ def test_the_exponent_of_the_growth_is_stated_beside_the_last_size(monkeypatch: 
     assert [row["note"] for row in rows] == ["", "", "grows with the power 2.00: more than linear"]
 
 
-@pytest.mark.slow
+@pytest.mark.computes
 def test_pixels_captures_and_scans_are_measured(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bench_scaling, "MEGAPIXELS", (0.05, 0.1))
     monkeypatch.setattr(bench_scaling, "CAPTURES", (2, 4))

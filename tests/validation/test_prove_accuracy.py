@@ -29,7 +29,7 @@ from slviewer.validation.prove_accuracy import (
     rig_cases,
 )
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.computes
 
 SHAPES = ("plane_03", "sphere_3", "sphere_4")
 """Inside the calibrated depths, where a few poses already suffice."""

@@ -8,7 +8,7 @@ from slviewer.validation.faulty_captures import FAULTS
 from slviewer.validation.proof import Proof
 from slviewer.validation.prove_causes import prove_causes
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.computes
 
 SINGLE = (
     "board transposed in one pose",

@@ -57,7 +57,7 @@ def test_cases_are_chosen_by_name():
         choose_cases(["jpg"])
 
 
-@pytest.mark.slow
+@pytest.mark.computes
 def test_three_cases_end_to_end():
     proof = prove_hostile(
         0.15, cases=["vignetting:mild:scan", "dropped-frame:medium:scan", "hand:mild:scan"], splined=False

@@ -21,7 +21,7 @@ from slviewer.wizard.jobs import Reporter
 from slviewer.wizard.operator import Operator
 from slviewer.wizard.snapshot import SessionView, Snapshot
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.computes
 
 RIG = {"driver": "simulated", "scale": 0.25, "seed": 0}
 

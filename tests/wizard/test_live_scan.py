@@ -26,7 +26,7 @@ from slviewer.wizard.live_frames import Stream
 from slviewer.wizard.live_scan import LiveCloud, LiveModel
 from slviewer.wizard.operator import Operator
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.computes
 
 SCALE = 0.15
 RIG = {"driver": "simulated", "scale": SCALE, "settle_ms": 4}  # what waits beside it needs the cores too

@@ -33,7 +33,7 @@ from slviewer.wizard.operator import Operator
 from slviewer.wizard.snapshot import SessionView
 from slviewer.wizard.surfaces import Surfaces, list_nominals, place_at, point_at
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.computes
 
 CENTRES = np.array([[-38.0, 0.0, 560.0], [42.0, 6.0, 570.0]])
 RADIUS = 25.0

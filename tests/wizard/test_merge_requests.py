@@ -22,7 +22,7 @@ from slviewer.wizard.operator import Operator
 from slviewer.wizard.result_views import merge_view
 from slviewer.wizard.snapshot import MergeView, Snapshot
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.computes
 
 STEP_DEG = 12.0
 MIDDLE = np.array([0.0, 0.0, 520.0])

@@ -15,7 +15,7 @@ from slviewer.wizard import acquisition, preview_watcher
 from slviewer.wizard.operator import Operator
 from slviewer.wizard.snapshot import Snapshot
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.computes
 
 RIG = {"driver": "simulated", "scale": 0.25, "seed": 0}
 TARGET = "circles:21x16:9"

@@ -13,7 +13,7 @@ from slviewer.pipeline.rig_presets import load_rig
 from slviewer.session.store import Session
 from slviewer.wizard.operator import Operator
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.computes
 
 RIG = {"driver": "simulated", "scale": 0.25, "seed": 0, "exposure_ms": 0.8}
 

@@ -14,7 +14,7 @@ from slviewer.wizard import acquisition
 from slviewer.wizard.operator import Operator
 from slviewer.wizard.snapshot import Snapshot
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.computes
 
 SCALE = 0.12
 RIG = {"driver": "simulated", "scale": SCALE, "turntable": {"driver": "simulated"}}
