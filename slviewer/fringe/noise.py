@@ -13,6 +13,8 @@ ROWS = 20
 BLOCK = 8
 """Neighbouring pixels whose variances are averaged before the median: single variances are too skewed."""
 BINS = 16
+QUANTISATION = 1 / 12
+"""Variance of rounding to whole grey levels, in squared grey levels: no frame has less noise."""
 OWN_HARMONICS = 4
 """Highest harmonic that is fitted pixel by pixel; those that gamma adds beyond it are below the noise."""
 
@@ -20,28 +22,28 @@ OWN_HARMONICS = 4
 def measure_noise(layout: Layout, stack: np.ndarray, white: float) -> tuple[float, float]:
     """Measure (a, b): the variance of one frame's grey level is a + b * level, in squared grey levels.
 
-    Both non-negative.
+    Both non-negative, and together at least what rounding to whole grey levels adds.
 
     From the residual of an n-step phase shift: per pixel, cosines up to a harmonic that n allows are removed; then,
     from all pixels together, what the remaining harmonics have in common with the fringe, so that gamma does not count
-    as noise. Three steps, and Gray code alone, have no such residual: then from the constancy of Gray + inverse, or
-    from differences along image rows or columns, whichever are smaller: those along the stripes. Sampled from a few
-    rows, or columns, of the image.
+    as noise. Three steps, and Gray code alone, have no such residual, nor have pixels that are black or saturated in
+    one of the steps (a gamma of 2.2 can make that all pixels): then from the constancy of Gray + inverse, or from
+    differences along image rows or columns, whichever are smaller: those along the stripes. Sampled from a few rows,
+    or columns, of the image.
     """
+    bins = []
     if layout.steps >= 4:
-        levels, variances, freedom = _measure_phase_step_noise(sample(stack, layout.shifts[-1].indices), white)
+        bins.append(_measure_phase_step_noise(sample(stack, layout.shifts[-1].indices), white))
     elif len(layout.inverse) >= 2:
-        levels, variances, freedom = _measure_inverse_noise(
-            sample(stack, layout.gray), sample(stack, layout.inverse), white
-        )
-    else:
+        bins.append(_measure_inverse_noise(sample(stack, layout.gray), sample(stack, layout.inverse), white))
+    if not any(len(levels) for levels, *_ in bins):
         frames = layout.shifts[-1].indices if layout.shifts else (layout.white, layout.black)
         indices = tuple(i for i in frames if i is not None)
-        along = [_measure_difference_noise(sample(s, indices), white) for s in (stack, stack.transpose(0, 2, 1))]
-        fits = [_bin_variances(*differences) for differences in along if len(differences[0])]
-        # Fringes and texture only ever add to the differences.
-        return _fit_line(*min(fits, key=_compute_mean_variance)) if fits else (0.0, 0.0)
-    return _fit_line(*_bin_variances(levels, variances, freedom))
+        bins = [_measure_difference_noise(sample(s, indices), white) for s in (stack, stack.transpose(0, 2, 1))]
+    fits = [_bin_variances(*measured) for measured in bins if len(measured[0])]
+    # Fringes and texture only ever add to the differences.
+    a, b = _fit_line(*min(fits, key=_compute_mean_variance)) if fits else (0.0, 0.0)
+    return (a, b) if a + b * white / 2 > QUANTISATION else (QUANTISATION, 0.0)
 
 
 def _compute_mean_variance(bins: tuple[np.ndarray, np.ndarray, np.ndarray]) -> float:
@@ -106,7 +108,10 @@ def _measure_difference_noise(samples: np.ndarray, white: float) -> tuple[np.nda
     if samples.shape[-1] < BLOCK:
         return np.zeros(0), np.zeros(0), 1.0
     usable = _select_unclipped_blocks(samples, white)
-    samples = samples[:, usable].reshape(-1, samples.shape[-1])  # each frame has its own level
+    if usable.any():
+        samples = samples[:, usable].reshape(-1, samples.shape[-1])  # each frame has its own level
+    else:
+        samples = samples[(samples.max(axis=-1) < white) & (samples.min(axis=-1) > 0)]
     third = np.diff(samples, n=3, axis=-1)
     return samples.mean(axis=-1), (third**2).mean(axis=-1) / 20, 2.5  # 1 + 9 + 9 + 1; five that overlap
 

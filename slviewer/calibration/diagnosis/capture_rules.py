@@ -215,15 +215,16 @@ def max_ripple_px(e: Evidence) -> float:
 
 
 def diagnose_ripple(e: Evidence) -> Iterator[Finding]:
-    """Yield a finding where residuals repeat with the fringe and exceed the noise: the fringe is not sinusoidal."""
-    ripples = {axis: r for axis, r in (e.solution.ripple if e.solution else {}).items() if r.rms_px > r.noise_px}
+    """Yield a finding where residuals repeat with the fringe and matter: the fringe is not sinusoidal."""
+    ripples = {axis: r for axis, r in (e.solution.ripple if e.solution else {}).items() if r.matters}
     if not ripples:
         return
-    axis, worst = max(ripples.items(), key=lambda item: item[1].rms_px / item[1].noise_px)
+    axis, worst = max(ripples.items(), key=lambda item: item[1].rms_px)
     steps = min((a.steps for p in e.poses for a in p.axes.values() if a.steps), default=0)
     observation = (
         f"the phase has an error that repeats {worst.waves} times a fringe period ({worst.rms_px:.2f} px RMS in "
-        f"{axis}, with {worst.noise_px:.2f} px of predicted noise)"
+        f"{axis}, {worst.rms_px * worst.mm_per_px:.3f} mm in depth; the noise of a point is {worst.noise_px:.2f} px, "
+        f"{worst.noise_px * worst.mm_per_px:.3f} mm)"
     )
     if steps and worst.waves % steps == 0:
         yield Finding(

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slviewer.calibration.observe import AXES, Observation
+from slviewer.calibration.observe import AXES, Observation, Samples
 from slviewer.calibration.stereo import StereoModel
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.polynomial import fit_polynomial
@@ -25,19 +25,31 @@ MIN_SAMPLES = 500
 MIN_RESPONSE = 0.15
 """Waves that the mean over a sample's block attenuates to less than this share of their amplitude are not fitted."""
 
+MIN_DEPTH_SHARE = 3e-5
+"""Depth errors of a smaller share of the depth do not matter: 18 um at 600 mm, half the Letter rig's noise floor."""
+
 
 @dataclass(frozen=True)
 class Ripple:
     """Ripple of one axis in projector px.
 
     ``rms_px``: RMS of all residuals that repeat with the fringe; ``waves``: waves per period of their strongest
-    component, ``strongest_px`` its RMS; ``noise_px``: median of the samples' predicted noise.
+    component, ``strongest_px`` its RMS; ``noise_px``: predicted noise of one camera pixel, median over the samples;
+    ``mm_per_px``: change of depth by one projector px, in the axis that gives the depth; ``depth_mm``: median depth of
+    the samples.
     """
 
     rms_px: float
     waves: int
     strongest_px: float
     noise_px: float
+    mm_per_px: float
+    depth_mm: float
+
+    @property
+    def matters(self) -> bool:
+        """Whether it is larger than the noise of a point and than `MIN_DEPTH_SHARE` of the depth."""
+        return self.rms_px > self.noise_px and self.rms_px * self.mm_per_px > MIN_DEPTH_SHARE * self.depth_mm
 
 
 def measure_ripple(observations: Sequence[Observation], stereo: StereoModel) -> dict[Axis, Ripple]:
@@ -46,31 +58,48 @@ def measure_ripple(observations: Sequence[Observation], stereo: StereoModel) -> 
     Axes without fringes or with too few samples are missing from the result.
     """
     residuals: dict[Axis, list[np.ndarray]] = {axis: [] for axis in AXES}
+    depths = []
     for o in observations:
         if o.samples is None or o.name not in stereo.poses:
             continue
-        detrended = _detrend_residuals(o, stereo)
+        points = _intersect_board(o.samples, stereo, o.name)
+        depths.append(_measure_depths(points, stereo))
+        detrended = _detrend_residuals(o.samples, o.samples.projector - stereo.rig.project(points))
         for column, axis in enumerate(AXES):
             if axis in detrended and o.periods_px[axis] > 2.0:
                 periods = o.samples.projector[:, column] / o.periods_px[axis]
                 block = np.broadcast_to(_measure_blocks(o.samples.camera, periods), (len(periods), 3))
                 residuals[axis].append(np.column_stack([periods, detrended[axis], o.samples.sigma[:, column], block]))
-    ripples = {axis: _fit_ripple(np.concatenate(rows)) for axis, rows in residuals.items() if rows}
+    if not depths:
+        return {}
+    depth_mm, mm_per_px = np.nanmedian(np.concatenate(depths), axis=0).tolist()
+    ripples = {axis: _fit_ripple(np.concatenate(rows), mm_per_px, depth_mm) for axis, rows in residuals.items() if rows}
     return {axis: ripple for axis, ripple in ripples.items() if ripple is not None}
 
 
-def _detrend_residuals(o: Observation, stereo: StereoModel) -> Mapping[Axis, np.ndarray]:
+def _intersect_board(samples: Samples, stereo: StereoModel, pose: str) -> np.ndarray:
+    """Return where the camera rays of a pose's samples meet its board: (n, 3) mm in the camera's frame."""
+    T = stereo.poses[pose]
+    rays = np.column_stack([stereo.rig.camera.undistort(samples.camera), np.ones(len(samples.camera))])
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.asarray(rays * ((T[:3, 2] @ T[:3, 3]) / (rays @ T[:3, 2]))[:, None])
+
+
+def _measure_depths(points: np.ndarray, stereo: StereoModel) -> np.ndarray:
+    """Return the depth in mm of points (n, 3), and how many mm it changes by one projector px along the ray: (n, 2)."""
+    further = points * (1 + 1.0 / points[:, 2:])  # by 1 mm
+    px_per_mm = np.abs(stereo.rig.project(further) - stereo.rig.project(points)).max(axis=1)
+    with np.errstate(divide="ignore"):
+        return np.column_stack([points[:, 2], 1.0 / px_per_mm])
+
+
+def _detrend_residuals(samples: Samples, difference: np.ndarray) -> Mapping[Axis, np.ndarray]:
     """Return measured less predicted projector coordinates (n,) px of a pose's samples, by axis.
 
     A polynomial in camera pixels is removed, which takes the lens distortion. Axes with too few samples are missing.
+    ``difference`` (n, 2) px.
     """
-    assert o.samples is not None
-    T = stereo.poses[o.name]
-    rays = np.column_stack([stereo.rig.camera.undistort(o.samples.camera), np.ones(len(o.samples.camera))])
-    with np.errstate(invalid="ignore", divide="ignore"):
-        points = rays * ((T[:3, 2] @ T[:3, 3]) / (rays @ T[:3, 2]))[:, None]
-    difference = o.samples.projector - stereo.rig.project(points)
-    u, v = o.samples.camera.T
+    u, v = samples.camera.T
     box = (u.min() - 0.5, v.min() - 0.5, u.max() + 0.5, v.max() + 0.5)
     detrended: dict[Axis, np.ndarray] = {}
     for column, axis in enumerate(AXES):
@@ -98,7 +127,7 @@ def _measure_blocks(camera: np.ndarray, periods: np.ndarray) -> np.ndarray:
     return np.array([abs(slopes[0]), abs(slopes[1]), max(1.0, round(side))])
 
 
-def _fit_ripple(samples: np.ndarray) -> Ripple | None:
+def _fit_ripple(samples: np.ndarray, mm_per_px: float, depth_mm: float) -> Ripple | None:
     """Fit waves of 1 to MAX_WAVES per fringe period to residuals, by least squares; None for fewer than MIN_SAMPLES.
 
     ``samples`` (n, 6): projector coordinate in periods, residual px, predicted noise px, and the three numbers of
@@ -125,5 +154,10 @@ def _fit_ripple(samples: np.ndarray) -> Ripple | None:
     power = np.maximum(np.sum(amplitudes**2, axis=0) / 2 - 2 * spread**2 / len(residual), 0.0)
     strongest = int(np.argmax(power))
     return Ripple(
-        float(np.sqrt(power.sum())), int(waves[strongest]), float(np.sqrt(power[strongest])), float(np.median(sigma))
+        rms_px=float(np.sqrt(power.sum())),
+        waves=int(waves[strongest]),
+        strongest_px=float(np.sqrt(power[strongest])),
+        noise_px=float(np.median(sigma * samples[:, 5])),  # the noise of a block's mean, times the block's side
+        mm_per_px=mm_per_px,
+        depth_mm=depth_mm,
     )
