@@ -1,8 +1,11 @@
 """Registration finds a known motion to hundredths of a millimetre, and refuses what it cannot know."""
 
+import re
+
 import numpy as np
 import pytest
 from bumpy_scans import CENTRE, NOISE, Height, bumpy, error, motion, view
+from facts import raises
 
 from slviewer.errors import Cancelled, InputError, SlviewerError
 from slviewer.registration.pairwise import register
@@ -88,16 +91,16 @@ def moulding(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    ("shape", "reason", "words"),
+    ("shape", "reason", "free"),
     [
-        (bumpy(2, 0.0), "plane", "flat.*slides along itself and turns about its normal"),
-        (cap, "sphere", "turns about any axis through its centre"),
-        (barrel, "cylinder", "slides along its axis and turns about it"),
-        (moulding, "slides", "slides along it"),
+        (bumpy(2, 0.0), "plane", ("flat", "slides", "turns", "normal")),
+        (cap, "sphere", ("turns", "centre")),
+        (barrel, "cylinder", ("slides", "turns", "axis")),
+        (moulding, "slides", ("slides",)),
     ],
 )
-def test_a_shape_that_slides_or_turns_is_refused_by_its_name(shape: Height, reason: str, words: str) -> None:
-    with pytest.raises(Refused, match=words) as refusal:
+def test_a_shape_that_slides_or_turns_is_refused_by_its_name(shape: Height, reason: str, free: tuple[str, ...]) -> None:
+    with raises(Refused, *free) as refusal:
         register(view(shape, (-45, 75), 1, motion(5, 10)), view(shape, (-75, 45), 2))
     assert refusal.value.reason == reason
 
@@ -110,9 +113,9 @@ def test_two_poses_that_fit_alike_are_refused_unless_one_is_chosen() -> None:
 
     T = motion(5, 10)
     scan, reference = view(twice, (-70, 70), 1, T), view(twice, (-75, 75), 2)
-    with pytest.raises(Refused, match=r"\d mm") as refusal:
+    with raises(Refused, "RMS") as refusal:
         register(scan, reference)
-    assert refusal.value.reason == "ambiguous"
+    assert refusal.value.reason == "ambiguous" and len(re.findall(r"[\d.]+ (?:mm|%)", str(refusal.value))) >= 3
     corners = CENTRE + np.array([[50.0, 50.0, 0.0], [-50.0, 40.0, 0.0], [40.0, -50.0, 0.0]])
     picks = (corners - T[:3, 3]) @ T[:3, :3] + np.random.default_rng(0).normal(0, 2.0, (3, 3))
     start, apart = fit_picked_start(picks, corners)
@@ -124,13 +127,15 @@ def test_two_poses_that_fit_alike_are_refused_unless_one_is_chosen() -> None:
 def test_picks_that_fix_no_pose_are_refused() -> None:
     line = CENTRE + np.array([[0.0, 0, 0], [10, 0, 0], [30, 1, 0]])
     triangle = CENTRE + np.array([[0.0, 0, 0], [40, 0, 0], [0, 30, 0]])
-    with pytest.raises(Refused, match="line"):
+    with raises(Refused, "scan", "line") as refusal:
         fit_picked_start(line, line)
-    with pytest.raises(Refused, match=r"\d mm"):
+    assert refusal.value.reason == "picks"
+    with raises(Refused, "mm") as refusal:
         fit_picked_start(triangle, triangle[[1, 2, 0]])
-    with pytest.raises(InputError, match="3"):
+    assert refusal.value.reason == "picks"
+    with raises(InputError, "2 point pairs", 3):
         fit_picked_start(triangle[:2], triangle[:2])
-    with pytest.raises(InputError, match="pairs"):
+    with raises(InputError, "(3, 3)", "(2, 3)"):
         fit_picked_start(triangle, triangle[:2])
     with pytest.raises(InputError):
         fit_picked_start(np.where(triangle == 40, np.nan, triangle), triangle)
@@ -173,11 +178,11 @@ def test_points_that_cannot_be_used_are_refused() -> None:
     good = view(bumpy(2), (-75, 45), 2)
     holed = good.copy()
     holed[5] = np.nan
-    with pytest.raises(InputError, match="finite"):
+    with raises(InputError, "scan", "finite"):
         register(holed, good)
     with pytest.raises(InputError):
         register(good[:20], good)
-    with pytest.raises(InputError, match=r"\(n, 3\)"):
+    with raises(InputError, "scan", "(n, 3)"):
         register(good.reshape(100, -1, 3), good)
-    with pytest.raises(InputError, match="normals"):
+    with raises(InputError, "scan", "normals"):
         register(good, good, scan_normals=good[:-1])

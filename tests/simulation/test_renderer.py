@@ -5,6 +5,7 @@ from dataclasses import replace
 import numba
 import numpy as np
 import pytest
+from facts import raises
 
 from slviewer.errors import InputError
 from slviewer.fringe.presets import p18, phase_steps
@@ -155,12 +156,12 @@ def test_the_psf_has_the_stated_width(sigma):
 
 def test_what_cannot_be_rendered_is_refused():
     rig = letter(0.25)
-    with pytest.raises(InputError, match="912x1140"):
+    with raises(InputError, "800x600", "912x1140"):
         Renderer(rig, blank_board(FACING)).capture(p18((800, 600)))
     with pytest.raises(InputError):
         Renderer(rig, sphere((5000.0, 0.0, 600.0))).capture(PHASE_X)
-    with pytest.raises(InputError, match="uint8"):
+    with raises(InputError, "(3, 4)", "uint8"):
         white = (None, np.full(912, 255, np.uint8))
         Renderer(rig, blank_board(FACING)).frame(white, np.zeros(2, np.uint32), np.zeros((3, 4), np.uint8))
-    with pytest.raises(InputError, match="scale"):
+    with raises(InputError, "scale 0"):
         letter(0.0)

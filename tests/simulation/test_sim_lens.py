@@ -5,6 +5,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from facts import raises
 
 from slviewer.errors import InputError
 from slviewer.simulation.lens import SimulatedLens
@@ -51,7 +52,7 @@ def test_points_behind_a_device_are_not_seen():
 
 
 def test_wrong_shapes_are_refused():
-    with pytest.raises(InputError, match="shape"):
+    with raises(InputError, "(4, 2)", "(..., 3)"):
         letter().camera.project(np.zeros((4, 2)))
 
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from facts import raises
 from rendered_board import View
 
 from slviewer.errors import DetectionError, InputError
@@ -94,7 +95,7 @@ def test_other_image_types_give_the_same() -> None:
 
 @pytest.mark.parametrize("image", [np.zeros((300, 400)), np.zeros((300, 400, 4), np.uint8), np.zeros((4, 4), np.uint8)])
 def test_what_is_no_image_is_refused(image: np.ndarray) -> None:
-    with pytest.raises(InputError, match="uint8 or uint16"):
+    with raises(InputError, "uint8", "uint16"):
         detect(BOARD, image)
 
 
@@ -174,14 +175,14 @@ def test_hidden_circles_are_counted_not_guessed(notation: str, hide: tuple[float
     board = Board.parse(notation)
     x, y = board.points[:, :2].T
     left = np.count_nonzero(~((x > hide[0]) & (y > hide[1]) & (x < hide[2]) & (y < hide[3])))
-    with pytest.raises(DetectionError, match=f"^{left} of {len(x)} "):
+    with raises(DetectionError, f"{left} of {len(x)}"):
         detect(board, replace(SMALL, hide=hide, tilt=10).render(board))
 
 
 @pytest.mark.parametrize("notation", ["circles:9x7:20", "acircles:4x11:20"])
 def test_partly_covered_circles_are_refused(notation: str) -> None:
-    with pytest.raises(DetectionError, match=r"\d+ of \d+"):
-        board = Board.parse(notation)
+    board = Board.parse(notation)
+    with raises(DetectionError, f"of {len(board.points)}"):
         detect(board, replace(SMALL, hide=(-30, -30, 190, -1.5), tilt=10).render(board))
 
 
@@ -190,23 +191,23 @@ def test_a_stain_on_one_circle_is_refused() -> None:
     image = view.render(BOARD)
     u, v = np.round(view.truth(BOARD)[30]).astype(int).tolist()
     cv2.circle(image, (u + 9, v), 3, 40, -1, cv2.LINE_AA)
-    with pytest.raises(DetectionError, match="1 of 63"):
+    with raises(DetectionError, "1 of 63"):
         detect(BOARD, image)
 
 
 def test_a_board_partly_out_of_view_is_refused() -> None:
-    with pytest.raises(DetectionError, match="of 63"):
+    with raises(DetectionError, "of 63"):
         detect(BOARD, replace(SMALL, shift=(70, 0)).render(BOARD))
 
 
 @pytest.mark.parametrize("wrong", ["circles:8x7:20", "circles:9x6:20", "circles:7x7:20"])
 def test_a_larger_grid_than_stated_is_refused(wrong: str) -> None:
-    with pytest.raises(DetectionError, match=r"63 .*columns"):
+    with raises(DetectionError, "63 circles", "columns"):
         detect(Board.parse(wrong), replace(SMALL, tilt=15).render(BOARD))
 
 
 def test_a_smaller_grid_than_stated_is_refused() -> None:
-    with pytest.raises(DetectionError, match="63 of 70"):
+    with raises(DetectionError, "63 of 70"):
         detect(Board.parse("circles:10x7:20"), replace(SMALL, tilt=15).render(BOARD))
 
 
@@ -218,23 +219,24 @@ def test_a_transposed_notation_is_the_same_board_turned() -> None:
 
 def test_squares_are_not_taken_for_circles() -> None:
     chessboard = Board.parse("chessboard:9x7:20")
-    with pytest.raises(DetectionError, match="squares"):
+    with raises(DetectionError, "squares"):
         detect(Board.parse("acircles:5x8:20"), replace(SMALL, blur=0.5, fill=0.5).render(chessboard))
 
 
 def test_overexposure_is_named() -> None:
-    with pytest.raises(DetectionError, match=r"exposure.*\d+%"):
-        detect(BOARD, replace(SMALL, paper=3000).render(BOARD))
+    image = replace(SMALL, paper=3000).render(BOARD)
+    with raises(DetectionError, "exposure", f"{np.mean(image[::4, ::4] == 255):.0%}", "saturated"):
+        detect(BOARD, image)
 
 
 def test_an_empty_image_is_refused() -> None:
     for level in (0, 128):
-        with pytest.raises(DetectionError, match="circles"):
+        with raises(DetectionError, "circles", 63):
             detect(BOARD, np.full((300, 400), level, np.uint8))
 
 
 def test_noise_is_refused() -> None:
-    with pytest.raises(DetectionError, match="circles"):
+    with raises(DetectionError, "circles", 63):
         detect(BOARD, np.random.default_rng(0).integers(0, 255, (300, 400), np.uint8))
 
 
