@@ -27,6 +27,8 @@ from slviewer.simulation.rig import letter
 from slviewer.simulation.truth import PerfectModel
 from slviewer.target.coded import detect_markers, draw_marker_sheet, marker_modules
 
+pytestmark = pytest.mark.computes
+
 RIG = letter(0.5, 2)
 TURNS = (((4.0, -6.0, 2.0), (0.0, 0.0, 620.0)), ((-5.0, 8.0, 16.0), (6.0, -4.0, 640.0)))
 
@@ -63,7 +65,8 @@ def largest_error(clouds: dict[str, Cloud], T: np.ndarray, true: np.ndarray) -> 
 
 
 @pytest.mark.parametrize(
-    ("make", "behind_mm", "reason"), [(marked_sphere, 60.0, "sphere"), (marked_cylinder, 0.0, "cylinder")]
+    ("make", "behind_mm", "reason"),
+    [(marked_sphere, 60.0, "sphere"), pytest.param(marked_cylinder, 0.0, "cylinder", marks=pytest.mark.slow)],
 )
 def test_markers_register_shapes_that_hold_no_pose(
     make: Callable[[Pose], MarkedScene], behind_mm: float, reason: str

@@ -8,14 +8,14 @@ from bumpy_scans import CENTRE, NOISE, Height, bumpy, error, motion, view
 from facts import raises
 
 from slviewer.errors import Cancelled, InputError, SlviewerError
-from slviewer.registration.pairwise import register
+from slviewer.registration.pairwise import Registration, register
 from slviewer.registration.picked import fit_picked_start
 from slviewer.registration.refusal import Refused
 
 pytestmark = pytest.mark.computes
 
 
-@pytest.mark.parametrize(("deg", "mm"), [(1.0, 2.0), (60.0, 150.0)])
+@pytest.mark.parametrize(("deg", "mm"), [pytest.param(1.0, 2.0, marks=pytest.mark.slow), (60.0, 150.0)])
 def test_a_known_motion_is_found(deg: float, mm: float) -> None:
     T = motion(deg, mm)
     result = register(view(bumpy(2), (-45, 75), 1, T), view(bumpy(2), (-75, 45), 2))
@@ -28,16 +28,21 @@ def test_a_known_motion_is_found(deg: float, mm: float) -> None:
     assert result.agreement > 0.98
 
 
-def test_the_same_scans_give_the_same_pose() -> None:
-    scan, reference = view(bumpy(2), (-45, 75), 1, motion(10, 30)), view(bumpy(2), (-75, 45), 2)
-    first, second = (register(scan, reference).T_reference_scan for _ in range(2))
-    np.testing.assert_allclose(first, second, atol=1e-7)
+SCANS = view(bumpy(2), (-45, 75), 1, motion(10, 30)), view(bumpy(2), (-75, 45), 2)
 
 
-def test_the_pose_maps_scan_to_reference_and_back() -> None:
-    scan, reference = view(bumpy(3), (-45, 75), 1, motion(10, 30)), view(bumpy(3), (-75, 45), 2)
-    forth, back = register(scan, reference), register(reference, scan)
-    shift, turn = error(forth, np.linalg.inv(back.T_reference_scan))
+@pytest.fixture(scope="module")
+def registered() -> Registration:
+    return register(*SCANS)
+
+
+def test_the_same_scans_give_the_same_pose(registered: Registration) -> None:
+    np.testing.assert_allclose(register(*SCANS).T_reference_scan, registered.T_reference_scan, atol=1e-7)
+
+
+def test_the_pose_maps_scan_to_reference_and_back(registered: Registration) -> None:
+    back = register(*SCANS[::-1])
+    shift, turn = error(registered, np.linalg.inv(back.T_reference_scan))
     assert shift < 0.03
     assert turn < 0.02
 
@@ -51,7 +56,7 @@ def test_a_third_of_overlap_is_enough() -> None:
     assert 0.28 < result.overlap < 0.38
 
 
-@pytest.mark.parametrize("scale", [0.2, 5.0])
+@pytest.mark.parametrize("scale", [0.2, pytest.param(5.0, marks=pytest.mark.slow)])
 def test_gates_follow_the_size_of_the_object(scale: float) -> None:
     T = motion(10, 30 * scale)
     scan = view(bumpy(2), (-45, 75), 1, T, scale=scale)
@@ -62,7 +67,7 @@ def test_gates_follow_the_size_of_the_object(scale: float) -> None:
     assert result.gate_mm < 10.0 if scale > 1 else result.gate_mm < 0.6
 
 
-@pytest.mark.parametrize(("relief", "other"), [(12.0, 52), (3.0, 58)])
+@pytest.mark.parametrize(("relief", "other"), [pytest.param(12.0, 52, marks=pytest.mark.slow), (3.0, 58)])
 def test_unrelated_shapes_are_refused(other: int, relief: float) -> None:
     with pytest.raises(SlviewerError):
         register(view(bumpy(other, relief), (-45, 75), 1, points=10_000), view(bumpy(2, relief), (-75, 45), 2))

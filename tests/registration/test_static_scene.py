@@ -66,7 +66,7 @@ def scans(deg: float, wall: bool) -> tuple[dict[str, Cloud], dict[str, np.ndarra
     return clouds, {name: cloud.points[..., 2] > 700 for name, cloud in clouds.items()}
 
 
-@pytest.mark.parametrize("deg", [2.0, 25.0])
+@pytest.mark.parametrize("deg", [pytest.param(2.0, marks=pytest.mark.slow), 25.0])
 def test_a_wall_behind_a_turned_object_is_recognised_and_does_not_move_it(deg: float) -> None:
     alone, _ = scans(deg, wall=False)
     clouds, wall = scans(deg, wall=True)
@@ -120,6 +120,7 @@ def test_contradictions_are_counted_where_one_scan_sees_through_the_others_point
     assert 0.001 < still < 0.5 * (1 - share)
 
 
+@pytest.mark.slow
 def test_real_shells_turn_while_their_background_stands_still(real_data: Path) -> None:
     clouds = {}
     calibration = real_data / "sltk_shells" / "procam_2016_12_09.yaml"

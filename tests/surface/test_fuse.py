@@ -11,6 +11,8 @@ from slviewer.errors import Cancelled, InputError
 from slviewer.surface.clean import detect_far_clusters
 from slviewer.surface.fuse import Fused, fuse
 
+pytestmark = pytest.mark.computes
+
 SIDE = (0.1, -0.05, -1.0)
 DEPTHS = {"near": (240.0, 0.02), "middle": (320.0, 0.04), "far": (400.0, 0.06)}
 

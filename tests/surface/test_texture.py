@@ -17,6 +17,8 @@ from slviewer.session.mesh_files import write_textured
 from slviewer.surface.shapes import Mesh
 from slviewer.surface.texture import TexturedMesh, texture_mesh
 
+pytestmark = pytest.mark.computes
+
 LIGHT = np.array([120.0, 10.0, -5.0])
 AWAY = 300.0
 
