@@ -72,7 +72,7 @@ def test_p18_texture_at_f26_or_nowhere_or_twice(tmp_path):
     assert [frame.kind for frame in bare.sequence.frames].count("texture") == 0 and len(bare.frames) == 50
     assert (double.frames[25] == 9).all()
     assert missing_facts(found.warnings[0], "pose_2", "texture") == [] and len(found.warnings) == 2
-    assert missing_facts(found.warnings[1], "pose_3", "P18_F25.PNG", "P18_F26.PNG") == []
+    assert missing_facts(found.warnings[1], "pose_3/V", "F25", "F26") == []
 
 
 def test_p18_in_colour_keeps_the_texture(tmp_path):

@@ -56,6 +56,7 @@ def slstudio_frames(codec: str) -> list[np.ndarray]:
     return frames or cosines(int(codec), COLUMNS, U)
 
 
+@pytest.mark.computes
 @pytest.mark.parametrize(
     ("codec", "least", "most"),
     [("2x3", 0.0, 0.3), ("nstep", 0.0, 0.3), ("3", 0.1, 3.0), ("4", 0.1, 3.0), ("gray", 0.0, 0.6)],
@@ -93,6 +94,7 @@ def test_slstudio_frames_that_fit_several_codecs_need_its_name(tmp_path):
         slstudio.LAYOUT.read(tmp_path, projector=SIZE)
 
 
+@pytest.mark.computes
 @pytest.mark.parametrize("shadow", [True, False])
 def test_opencv_generates_columns_then_rows_each_with_its_inverse(tmp_path, shadow):
     patterns = [
@@ -120,6 +122,7 @@ def test_opencv_generates_columns_then_rows_each_with_its_inverse(tmp_path, shad
         opencv_graycode.read(tmp_path, projector=(4000, ROWS), files="pattern_cam1_*")
 
 
+@pytest.mark.computes
 def test_sltk_names_say_axis_bit_and_negative(tmp_path):
     number = 0
     for axis, (at, bits) in enumerate(((U, 10), (V, 7))):

@@ -86,10 +86,10 @@ def corners_of(board: Board, away: float, radius: float) -> tuple[Disc, ...]:
         corners_of(SYMMETRIC, 0.8, 0.2)[:1],  # a screw
         ((-0.8, -0.5, 0.13, 0.08),),  # a dot of the mark's size beside its place
         *often(
-            corners_of(SYMMETRIC, 0.6, 0.25)[3:],
-            corners_of(SYMMETRIC, 0.62, 0.04)[:1],  # a speck of dirt
-            ((9.0, 6.9, 0.5, 0.08),),
-            tuple((x, -0.65, 0.12, 0.08) for x in np.linspace(-0.9, 3.0, 14)),  # a line of print
+            (corners_of(SYMMETRIC, 0.6, 0.25)[3:],),
+            (corners_of(SYMMETRIC, 0.62, 0.04)[:1],),  # a speck of dirt
+            (((9.0, 6.9, 0.5, 0.08),),),
+            (tuple((x, -0.65, 0.12, 0.08) for x in np.linspace(-0.9, 3.0, 14)),),  # a line of print
         ),
     ],
 )

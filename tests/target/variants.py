@@ -7,7 +7,7 @@ import pytest
 
 
 def often(*variants: Any) -> list[Any]:
-    """Return parameters of variants, single values or tuples, that only the slow tier runs."""
+    """Return parameters of variants, tuples of values or single ones, that only the slow tier runs."""
     return [pytest.param(*(v if type(v) is tuple else (v,)), marks=pytest.mark.slow) for v in variants]
 
 
