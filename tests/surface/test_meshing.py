@@ -44,7 +44,7 @@ def test_scans_all_around_close(points: PointSet, closed: BuiltMesh) -> None:
     assert closed.mesh.colours is not None and closed.mesh.sigma_mm is not None and closed.mesh.normals is not None
     outwards = (closed.mesh.normals * closed.mesh.vertices).sum(axis=1) / RADIUS
     assert np.percentile(outwards, 1) > 0.98
-    assert missing_facts(closed.text(), "watertight", f"{closed.topology.volume_mm3:,.0f}") == []
+    assert missing_facts(closed.text(), "watertight", f"{closed.topology.volume_mm3 / 1000:.2f} cm3") == []
     assert closed.to_json()["watertight"] is True
 
 
@@ -59,7 +59,7 @@ def test_what_no_scan_saw_stays_open_or_is_closed_as_asked(open_points: PointSet
     assert wide.topology.watertight and wide.trimmed is not None
     assert wide.trimmed.filled == 1 and 0.01 < wide.trimmed.imagined < 0.15
     assert wide.topology.volume_mm3 == pytest.approx(VOLUME, rel=0.03)
-    assert missing_facts(wide.text(), f"{100 * wide.trimmed.imagined:.0f} %") == []
+    assert missing_facts(wide.text(), f"{100 * wide.trimmed.imagined:.1f} %") == []
 
 
 def test_what_floats_where_nothing_was_measured_goes_whatever_holes_are_filled(points: PointSet) -> None:
