@@ -67,7 +67,7 @@ def test_a_writer_killed_at_any_moment_leaves_whole_captures(tmp_path, sequence,
     ) as writers:
         for height in (8, 480, 1600):
             for _ in range(kills):
-                print(height, rng.integers(20, 400), file=writers.stdin)
+                print(height, rng.integers(20, 200), file=writers.stdin)
                 assert writers.stdout.readline() == f"{signal.SIGKILL:d}\n"
                 caught_in_the_act += bool(atomic.list_leftovers(folder))
                 with Session.open(folder, write=True) as session:
