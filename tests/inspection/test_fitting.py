@@ -15,6 +15,8 @@ from slviewer.inspection.uncertainty import scatter_covariance
 from slviewer.records import from_plain
 from slviewer.session.atomic import to_json
 
+pytestmark = pytest.mark.computes
+
 
 def test_a_sphere_with_strays_has_its_radius_within_its_uncertainty() -> None:
     found = fit_feature("sphere", strewn(sphere(6000, 50.0, 0.6, 0.03), 0.15))

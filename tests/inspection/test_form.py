@@ -12,6 +12,8 @@ from slviewer.inspection.quantities import Quantity
 from slviewer.inspection.tolerance import judge_limits
 from slviewer.validation.prove_plan import CASES
 
+pytestmark = pytest.mark.computes
+
 N, NOISE = 3000, 0.02
 
 

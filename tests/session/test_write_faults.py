@@ -69,7 +69,9 @@ def new(sequence, noise):
     return lambda *seeds, source="": [NewCapture(f"pose_{i}", sequence, noise(i), None, source) for i in seeds]
 
 
-@pytest.mark.parametrize("fault", FAULTS)
+@pytest.mark.parametrize(
+    "fault", [pytest.param(name, marks=[] if name in ("kill", "disk full") else pytest.mark.slow) for name in FAULTS]
+)
 def test_several_captures_are_saved_whatever_happens(tmp_path, new, fault):
     def attempt(folder: Path, disk: Disk) -> None:
         with faulty(disk), opened_or_made(folder) as session:
@@ -98,7 +100,9 @@ def test_several_captures_are_saved_whatever_happens(tmp_path, new, fault):
     assert {0, 3} <= counts if fault != "kill" else counts == {0, 1, 2, 3}
 
 
-@pytest.mark.parametrize("fault", FAULTS)
+@pytest.mark.parametrize(
+    "fault", [pytest.param(name, marks=[] if name in ("kill", "disk full") else pytest.mark.slow) for name in FAULTS]
+)
 def test_a_replacement_is_the_old_or_the_new(tmp_path, sequence, new, fault):
     def attempt(folder: Path, disk: Disk) -> None:
         with faulty(disk), Session.open(folder, write=True) as session:

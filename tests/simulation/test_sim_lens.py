@@ -12,6 +12,8 @@ from slviewer.simulation.lens import SimulatedLens
 from slviewer.simulation.rig import letter
 from slviewer.simulation.waves import displace
 
+pytestmark = pytest.mark.computes
+
 
 def grid(lens: SimulatedLens, n: int = 41) -> np.ndarray:
     width, height = lens.size

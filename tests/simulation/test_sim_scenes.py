@@ -14,6 +14,8 @@ from slviewer.simulation.rig import letter
 from slviewer.simulation.scenes import Spheres, sphere
 from slviewer.target.board import Board
 
+pytestmark = pytest.mark.computes
+
 RIG = letter(0.25)
 TILTED = Pose(rotation(np.array([0.2, -0.3, 0.1])), np.array([5.0, -4.0, 600.0]))
 
