@@ -42,13 +42,13 @@ def sync_folder(folder: Path) -> None:
         os.close(descriptor)
 
 
-def rename(source: Path, target: Path) -> None:
+def rename(source: Path, target: Path, patience_s: float = _PATIENCE_S) -> None:
     """Rename a file over another one, or a folder to a name that is free.
 
     Windows refuses while another program has it open, such as a virus scanner, an indexer or a copy of the folder: it
-    is tried again for `_PATIENCE_S`.
+    is tried again for ``patience_s``.
     """
-    end = time.monotonic() + _PATIENCE_S
+    end = time.monotonic() + patience_s
     while True:
         try:
             os.replace(source, target) if source.is_file() else os.rename(source, target)
@@ -83,14 +83,15 @@ def replace_json(path: Path, data: Any) -> None:
     replace_file(path, to_json(data))
 
 
-def replace_file(path: Path, data: bytes) -> None:
-    """Replace a file by a new one in one step. Raises SessionError where the disk refuses; the old one then stays."""
+def replace_file(path: Path, data: bytes, patience_s: float = _PATIENCE_S) -> None:
+    """Replace a file by a new one in one step. Raises SessionError where the disk refuses, or another program still has
+    the old one open after ``patience_s``; the old one then stays."""
     temporary = _staging_path(path, "tmp")
     with disk_errors(path.parent, len(data)):
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
             write_bytes(temporary, data)
-            rename(temporary, path)
+            rename(temporary, path, patience_s)
         except BaseException:
             temporary.unlink(missing_ok=True)
             raise

@@ -61,25 +61,25 @@ class Nominal:
         return f"{self.name}: {len(self.mesh.faces):,} triangles, {kind}, {size} mm"
 
 
-def read_nominal(path: Path | str, units: Units | None = None) -> Nominal:
+def read_nominal(path: Path | str, units: Units | None = None, max_triangles: int = MAX_TRIANGLES) -> Nominal:
     """The model in an STL, PLY or OBJ file, whose numbers are in ``units``, or where none are given in mm; or in a STEP
     or 3MF file, which states its units.
 
     Raises SessionError for a file that cannot be used, with the reason: one that is absent, too large, damaged,
-    truncated, of another format, or without triangles.
+    truncated, of another format, without triangles, or with more than ``max_triangles``.
     """
     path = expand_user(path)
     data = _read_bytes(path)
     notes: list[str] = []
     if (form := path.suffix.lower()[1:]) in cad.PACKAGES:
         vertices, faces = _weld(*cad.load_triangles(path.name, form, data))
-        _check_triangles(path.name, vertices, faces)
+        _check_triangles(path.name, vertices, faces, max_triangles)
         units = "mm"
         if form != "3mf":
             notes.append(f"its surfaces were triangulated within {cad.CHORD_MM:g} mm")
     else:
-        vertices, faces = _load_triangles(path.name, data)
-        _check_triangles(path.name, vertices, faces)
+        vertices, faces = _load_triangles(path.name, data, max_triangles)
+        _check_triangles(path.name, vertices, faces, max_triangles)
         vertices = vertices * MM[units or "mm"]
     if not np.abs(vertices).max() < MAX_COORDINATE_MM:
         raise SessionError(
@@ -132,12 +132,12 @@ def _read_bytes(path: Path) -> bytes:
         raise SessionError(f"{path} cannot be read ({reason}): give a file of up to {MAX_BYTES >> 20} MiB") from error
 
 
-def _load_triangles(name: str, data: bytes) -> tuple[np.ndarray, np.ndarray]:
+def _load_triangles(name: str, data: bytes, max_triangles: int) -> tuple[np.ndarray, np.ndarray]:
     """Return vertices (n, 3) float64 and faces (m, 3) int64 of a file, unchanged but for merged duplicate vertices."""
     import trimesh
 
     form = name.rpartition(".")[2].lower()
-    data = _simplify(name, form, data)
+    data = _simplify(name, form, data, max_triangles)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -159,26 +159,26 @@ def _load_triangles(name: str, data: bytes) -> tuple[np.ndarray, np.ndarray]:
     return vertices, faces
 
 
-def _check_triangles(name: str, vertices: np.ndarray, faces: np.ndarray) -> None:
+def _check_triangles(name: str, vertices: np.ndarray, faces: np.ndarray, max_triangles: int) -> None:
     """Raise SessionError where vertices and faces are no triangles, too many, or reach beyond what is read."""
     if vertices.ndim != 2 or vertices.shape[1:] != (3,) or faces.ndim != 2 or faces.shape[1:] != (3,) or not len(faces):
         raise SessionError(f"{name} holds no triangles, or is damaged: export the model as a mesh")
-    if len(faces) > MAX_TRIANGLES:
-        raise _too_many(name, f"{len(faces):,} triangles")
+    if len(faces) > max_triangles:
+        raise _too_many(name, f"{len(faces):,} triangles", max_triangles)
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise SessionError(f"{name} has triangles whose points are missing: export the model again")
     if not np.isfinite(vertices).all():
         raise SessionError(f"{name} holds points that are no numbers (NaN or infinite): export the model again")
 
 
-def _simplify(name: str, form: str, data: bytes) -> bytes:
+def _simplify(name: str, form: str, data: bytes, max_triangles: int) -> bytes:
     """Return a file without what only costs time: the groups of an OBJ, all but one of the sections of a text STL.
 
     Raises SessionError for one of more triangles than are read, counted before anything is loaded.
     """
     is_text = form == "obj" or (form == "stl" and _is_text_stl(data))
     if is_text and len(data) > MAX_TEXT_BYTES:
-        raise _too_many(name, f"{len(data) / 1e6:.0f} MB of text")
+        raise _too_many(name, f"{len(data) / 1e6:.0f} MB of text", max_triangles)
     if form == "obj":
         data = b"\n".join(re.findall(rb"^[ \t]*[vf][ \t][^\r\n]*", data.replace(b"\\\n", b" "), re.MULTILINE))
         corners = max(map(len, map(bytes.split, re.findall(rb"^[ \t]*f[^\n]*", data, re.MULTILINE))), default=0)
@@ -197,8 +197,8 @@ def _simplify(name: str, form: str, data: bytes) -> bytes:
             raise SessionError(
                 f"{name} holds no triangles, or is truncated: it announces {count:,} triangles; export the model again"
             )
-    if count > MAX_TRIANGLES:
-        raise _too_many(name, f"{count:,} triangles")
+    if count > max_triangles:
+        raise _too_many(name, f"{count:,} triangles", max_triangles)
     return data
 
 
@@ -221,9 +221,9 @@ def _is_text_stl(data: bytes) -> bool:
     return data[:512].lstrip().lower().startswith(b"solid") and not binary
 
 
-def _too_many(name: str, amount: str) -> SessionError:
+def _too_many(name: str, amount: str, max_triangles: int) -> SessionError:
     """Return the error for a model that is too large."""
-    return SessionError(f"{name} has {amount}, and at most {MAX_TRIANGLES:,} triangles are read: decimate it first")
+    return SessionError(f"{name} has {amount}, and at most {max_triangles:,} triangles are read: decimate it first")
 
 
 def _drop_degenerate(

@@ -3,14 +3,16 @@
 import numpy as np
 import pytest
 import trimesh
+from facts import raises
 
-from slviewer.errors import InputError, SlviewerError
+from slviewer.errors import InputError
 from slviewer.inspection import placing
 from slviewer.inspection.colours import EXCLUDED_COLOUR, colour_limit, deviation_colours
 from slviewer.inspection.deviation import Deviation, deviation
 from slviewer.inspection.nominal_surface import NominalSurface
 from slviewer.inspection.tolerance import ToleranceVerdict, judge_deviation
 from slviewer.records import from_plain, to_plain
+from slviewer.registration.refusal import Refused
 from slviewer.simulation.boards import Pose
 from slviewer.simulation.mesh import MeshScene, demo_object
 from slviewer.simulation.plans import rotation
@@ -128,14 +130,16 @@ def test_a_bump_of_a_tenth_is_seen_within_5_microns() -> None:
 
 
 @pytest.mark.computes
-def test_a_part_that_looks_alike_from_two_sides_is_placed_on_either(monkeypatch) -> None:
-    monkeypatch.setattr(placing, "VIEWS", placing.VIEWS[-2:])  # corners; a box has no front
+def test_a_part_that_looks_alike_from_two_sides_is_placed_on_either() -> None:
     box = trimesh.creation.box((60, 40, 20))
     points, normals = box_scan(0.01)
     z = np.array([-0.5, 0.5, -0.7071])  # the camera sees all three sides
     x = np.cross([0.0, 1.0, 0.0], z)
     R = np.stack([x / np.linalg.norm(x), np.cross(z, x) / np.linalg.norm(x), z])
-    found = deviation(points @ R.T + [10, -5, 480], Mesh(box.vertices, box.faces), normals=normals @ R.T)
+    scan, facing, nominal = points @ R.T + [10, -5, 480], normals @ R.T, Mesh(box.vertices, box.faces)
+    views = placing.VIEWS[-2:]  # corners; a box has no front
+    start = placing.search_start(scan, facing, NominalSurface(nominal), None, lambda share: None, views)
+    found = deviation(scan, nominal, normals=facing, initial=start.T_reference_scan)
     assert 0.0095 < found.statistics()["rms"] < 0.0125 and found.statistics()["left_out"] < 100
 
 
@@ -182,14 +186,15 @@ def test_a_scan_without_points_is_refused(ammonite) -> None:
 
 
 def test_another_part_is_refused_without_refining_any_pose(ammonite, monkeypatch) -> None:
-    monkeypatch.setattr(placing, "VIEWS", placing.VIEWS[:2])
     monkeypatch.setattr(placing, "register_prepared", lambda *given, **options: pytest.fail("a pose was refined"))
     _, _, points, normals = ammonite
     seen = np.isfinite(points[..., 0])
-    other = trimesh.creation.box((120, 100, 70))
-    with pytest.raises(SlviewerError, match="see that it shows this part"):
-        deviation(points[seen][::3], Mesh(other.vertices, other.faces), normals=normals[seen][::3])
-    with pytest.raises(InputError, match="triangles"):
+    box = trimesh.creation.box((120, 100, 70))
+    other = NominalSurface(Mesh(box.vertices, box.faces))
+    with raises(Refused, "nominal model", "%") as refusal:
+        placing.search_start(points[seen][::3], normals[seen][::3], other, None, lambda share: None, placing.VIEWS[:2])
+    assert refusal.value.reason == "overlap"
+    with raises(InputError, "triangles"):
         NominalSurface(Mesh(np.zeros((3, 3)), np.zeros((0, 3), int)))
 
 

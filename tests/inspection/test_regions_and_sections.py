@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from facts import raises
 from scipy.spatial.transform import Rotation
 
 from slviewer.errors import InputError
@@ -25,7 +26,7 @@ def test_regions_hold_the_points_they_were_made_of() -> None:
 
 
 def test_regions_that_cannot_be_are_refused() -> None:
-    with pytest.raises(InputError, match="0 mm"):
+    with raises(InputError, "0 mm"):
         Region.ball([0, 0, 0], 0.0)
     with pytest.raises(InputError):
         Region.ball([0, np.nan, 0], 1.0)
@@ -80,7 +81,7 @@ def test_sections_that_cannot_be_are_refused() -> None:
         CutPlane.through([0, 0, 0], [0, 0, 0], [0, 1, 0])
     with pytest.raises(InputError):
         CutPlane.through([0, 0, 0], [0, 5, 0], [0, 1, 0])
-    with pytest.raises(InputError, match="line"):
+    with raises(InputError, "line"):
         radius_through(np.zeros(2), np.ones(2), 3 * np.ones(2))
 
 

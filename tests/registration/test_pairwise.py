@@ -1,18 +1,21 @@
 """Registration finds a known motion to hundredths of a millimetre, and refuses what it cannot know."""
 
+import re
+
 import numpy as np
 import pytest
 from bumpy_scans import CENTRE, NOISE, Height, bumpy, error, motion, view
+from facts import raises
 
 from slviewer.errors import Cancelled, InputError, SlviewerError
-from slviewer.registration.pairwise import register
+from slviewer.registration.pairwise import Registration, register
 from slviewer.registration.picked import fit_picked_start
 from slviewer.registration.refusal import Refused
 
 pytestmark = pytest.mark.computes
 
 
-@pytest.mark.parametrize(("deg", "mm"), [(1.0, 2.0), (60.0, 150.0)])
+@pytest.mark.parametrize(("deg", "mm"), [pytest.param(1.0, 2.0, marks=pytest.mark.slow), (60.0, 150.0)])
 def test_a_known_motion_is_found(deg: float, mm: float) -> None:
     T = motion(deg, mm)
     result = register(view(bumpy(2), (-45, 75), 1, T), view(bumpy(2), (-75, 45), 2))
@@ -25,16 +28,21 @@ def test_a_known_motion_is_found(deg: float, mm: float) -> None:
     assert result.agreement > 0.98
 
 
-def test_the_same_scans_give_the_same_pose() -> None:
-    scan, reference = view(bumpy(2), (-45, 75), 1, motion(10, 30)), view(bumpy(2), (-75, 45), 2)
-    first, second = (register(scan, reference).T_reference_scan for _ in range(2))
-    np.testing.assert_allclose(first, second, atol=1e-7)
+SCANS = view(bumpy(2), (-45, 75), 1, motion(10, 30)), view(bumpy(2), (-75, 45), 2)
 
 
-def test_the_pose_maps_scan_to_reference_and_back() -> None:
-    scan, reference = view(bumpy(3), (-45, 75), 1, motion(10, 30)), view(bumpy(3), (-75, 45), 2)
-    forth, back = register(scan, reference), register(reference, scan)
-    shift, turn = error(forth, np.linalg.inv(back.T_reference_scan))
+@pytest.fixture(scope="module")
+def registered() -> Registration:
+    return register(*SCANS)
+
+
+def test_the_same_scans_give_the_same_pose(registered: Registration) -> None:
+    np.testing.assert_allclose(register(*SCANS).T_reference_scan, registered.T_reference_scan, atol=1e-7)
+
+
+def test_the_pose_maps_scan_to_reference_and_back(registered: Registration) -> None:
+    back = register(*SCANS[::-1])
+    shift, turn = error(registered, np.linalg.inv(back.T_reference_scan))
     assert shift < 0.03
     assert turn < 0.02
 
@@ -48,7 +56,7 @@ def test_a_third_of_overlap_is_enough() -> None:
     assert 0.28 < result.overlap < 0.38
 
 
-@pytest.mark.parametrize("scale", [0.2, 5.0])
+@pytest.mark.parametrize("scale", [0.2, pytest.param(5.0, marks=pytest.mark.slow)])
 def test_gates_follow_the_size_of_the_object(scale: float) -> None:
     T = motion(10, 30 * scale)
     scan = view(bumpy(2), (-45, 75), 1, T, scale=scale)
@@ -59,7 +67,7 @@ def test_gates_follow_the_size_of_the_object(scale: float) -> None:
     assert result.gate_mm < 10.0 if scale > 1 else result.gate_mm < 0.6
 
 
-@pytest.mark.parametrize(("relief", "other"), [(12.0, 52), (3.0, 58)])
+@pytest.mark.parametrize(("relief", "other"), [pytest.param(12.0, 52, marks=pytest.mark.slow), (3.0, 58)])
 def test_unrelated_shapes_are_refused(other: int, relief: float) -> None:
     with pytest.raises(SlviewerError):
         register(view(bumpy(other, relief), (-45, 75), 1, points=10_000), view(bumpy(2, relief), (-75, 45), 2))
@@ -88,16 +96,16 @@ def moulding(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    ("shape", "reason", "words"),
+    ("shape", "reason", "free"),
     [
-        (bumpy(2, 0.0), "plane", "flat.*slides along itself and turns about its normal"),
-        (cap, "sphere", "turns about any axis through its centre"),
-        (barrel, "cylinder", "slides along its axis and turns about it"),
-        (moulding, "slides", "slides along it"),
+        (bumpy(2, 0.0), "plane", ("flat", "slides", "turns", "normal")),
+        (cap, "sphere", ("turns", "centre")),
+        (barrel, "cylinder", ("slides", "turns", "axis")),
+        (moulding, "slides", ("slides",)),
     ],
 )
-def test_a_shape_that_slides_or_turns_is_refused_by_its_name(shape: Height, reason: str, words: str) -> None:
-    with pytest.raises(Refused, match=words) as refusal:
+def test_a_shape_that_slides_or_turns_is_refused_by_its_name(shape: Height, reason: str, free: tuple[str, ...]) -> None:
+    with raises(Refused, *free) as refusal:
         register(view(shape, (-45, 75), 1, motion(5, 10)), view(shape, (-75, 45), 2))
     assert refusal.value.reason == reason
 
@@ -110,9 +118,9 @@ def test_two_poses_that_fit_alike_are_refused_unless_one_is_chosen() -> None:
 
     T = motion(5, 10)
     scan, reference = view(twice, (-70, 70), 1, T), view(twice, (-75, 75), 2)
-    with pytest.raises(Refused, match=r"\d mm") as refusal:
+    with raises(Refused, "RMS") as refusal:
         register(scan, reference)
-    assert refusal.value.reason == "ambiguous"
+    assert refusal.value.reason == "ambiguous" and len(re.findall(r"[\d.]+ (?:mm|%)", str(refusal.value))) >= 3
     corners = CENTRE + np.array([[50.0, 50.0, 0.0], [-50.0, 40.0, 0.0], [40.0, -50.0, 0.0]])
     picks = (corners - T[:3, 3]) @ T[:3, :3] + np.random.default_rng(0).normal(0, 2.0, (3, 3))
     start, apart = fit_picked_start(picks, corners)
@@ -124,13 +132,15 @@ def test_two_poses_that_fit_alike_are_refused_unless_one_is_chosen() -> None:
 def test_picks_that_fix_no_pose_are_refused() -> None:
     line = CENTRE + np.array([[0.0, 0, 0], [10, 0, 0], [30, 1, 0]])
     triangle = CENTRE + np.array([[0.0, 0, 0], [40, 0, 0], [0, 30, 0]])
-    with pytest.raises(Refused, match="line"):
+    with raises(Refused, "scan", "line") as refusal:
         fit_picked_start(line, line)
-    with pytest.raises(Refused, match=r"\d mm"):
+    assert refusal.value.reason == "picks"
+    with raises(Refused, "mm") as refusal:
         fit_picked_start(triangle, triangle[[1, 2, 0]])
-    with pytest.raises(InputError, match="3"):
+    assert refusal.value.reason == "picks"
+    with raises(InputError, "2 point pairs", 3):
         fit_picked_start(triangle[:2], triangle[:2])
-    with pytest.raises(InputError, match="pairs"):
+    with raises(InputError, "(3, 3)", "(2, 3)"):
         fit_picked_start(triangle, triangle[:2])
     with pytest.raises(InputError):
         fit_picked_start(np.where(triangle == 40, np.nan, triangle), triangle)
@@ -173,11 +183,11 @@ def test_points_that_cannot_be_used_are_refused() -> None:
     good = view(bumpy(2), (-75, 45), 2)
     holed = good.copy()
     holed[5] = np.nan
-    with pytest.raises(InputError, match="finite"):
+    with raises(InputError, "scan", "finite"):
         register(holed, good)
     with pytest.raises(InputError):
         register(good[:20], good)
-    with pytest.raises(InputError, match=r"\(n, 3\)"):
+    with raises(InputError, "scan", "(n, 3)"):
         register(good.reshape(100, -1, 3), good)
-    with pytest.raises(InputError, match="normals"):
+    with raises(InputError, "scan", "normals"):
         register(good, good, scan_normals=good[:-1])

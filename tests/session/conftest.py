@@ -1,6 +1,3 @@
-import os
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -31,11 +28,3 @@ def noise():
 @pytest.fixture
 def frames(noise):
     return noise(1)
-
-
-@pytest.fixture
-def real_data():
-    folder = Path(os.environ.get("SLVIEWER_REAL_DATA", Path(__file__).parents[3] / "shared" / "data"))
-    if not folder.is_dir():
-        pytest.skip(f"no real captures in {folder}")
-    return folder

@@ -3,6 +3,7 @@
 import cv2
 import numpy as np
 import pytest
+from facts import raises
 
 from slviewer.errors import InputError
 from slviewer.session.exporters import write_calibration
@@ -31,6 +32,7 @@ def write(path, entries):
     return path
 
 
+@pytest.mark.process
 @pytest.mark.parametrize("suffix", [".yml", ".xml", ".json"])
 def test_a_file_of_opencv_is_read(tmp_path, suffix):
     read = opencv_calibration.read_matrices(
@@ -44,6 +46,7 @@ def test_a_file_of_opencv_is_read(tmp_path, suffix):
         np.testing.assert_allclose(read[entry], expected.reshape(shape), rtol=1e-14, atol=1e-14)
 
 
+@pytest.mark.process
 @pytest.mark.parametrize("suffix", [".yml", ".yaml", ".xml", ".json"])
 def test_what_is_written_is_read_back(tmp_path, suffix):
     entries = dict(zip(opencv_calibration.ENTRIES, rig().values(), strict=True))
@@ -62,7 +65,7 @@ def test_what_cannot_be_written_leaves_the_old_file(tmp_path):
     path = tmp_path / "a.yml"
     write_calibration(path, {"a": 1})
     before = path.read_bytes()
-    with pytest.raises(InputError, match=r"\bb\b"):
+    with raises(InputError, "b"):
         write_calibration(path, {"a": 1, "b": np.zeros((2, 2, 2))})
     with pytest.raises(InputError):
         write_calibration(tmp_path / "a.txt", {"a": 1})
@@ -70,31 +73,41 @@ def test_what_cannot_be_written_leaves_the_old_file(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("change", "facts"),
     [
-        ({"T": None, "trans": None}, "has no trans: its keys are M1, D1, M2, D2, rot"),
-        ({"rot": np.eye(3) * 1.01}, "rot is no rotation"),
-        ({"rot": -np.eye(3)}, "rot is no rotation"),
-        ({"rot": np.zeros((3, 1))}, r"rot has shape \(3, 1\)"),
-        ({"trans": np.zeros((2, 1))}, r"trans has shape \(2, 1\)"),
-        ({"trans": np.array([[0.3, 0.0, 0.0]])}, "in mm"),
-        ({"trans": np.array([[1e308, 1e308, 0.0]])}, "in mm"),
-        ({"M1": np.eye(4)}, "a camera matrix is 3x3"),
-        ({"M1": rig()["M1"].T}, "no camera matrix"),
-        ({"M1": rig()["M1"] + np.array([[0, 2, 0], [0, 0, 0], [0, 0, 0]])}, "skew"),
-        ({"M1": rig()["M1"] * np.nan}, "not finite"),
-        ({"D1": np.full((1, 8), 0.1)}, "8 coefficients .* cannot represent"),
-        ({"D1": np.zeros((1, 6))}, "4, 5, 8, 12 or 14"),
-        ({"M2": "words"}, "M2 is no matrix"),
+        ({"trans": "absent"}, ("trans", "M1", "D1", "M2", "D2", "rot")),
+        ({"rot": np.eye(3) * 1.01}, ("rot", "rotation", 0.01, 1.03)),
+        ({"rot": -np.eye(3)}, ("rot", "rotation", "determinant -1")),
+        ({"rot": np.zeros((3, 1))}, ("rot", "(3, 1)")),
+        ({"trans": np.zeros((2, 1))}, ("trans", "(2, 1)")),
+        ({"trans": np.array([[0.3, 0.0, 0.0]])}, ("trans", 0.3, "mm")),
+        ({"trans": np.array([[1e308, 1e308, 0.0]])}, ("trans", "1.41e+308", "mm")),
+        ({"M1": np.eye(4)}, ("M1", "(4, 4)", "3x3")),
+        ({"M1": rig()["M1"].T}, ("M1", "camera matrix")),
+        ({"M1": rig()["M1"] + np.array([[0, 2, 0], [0, 0, 0], [0, 0, 0]])}, ("M1", "skew", 2)),
+        ({"M1": rig()["M1"] * np.nan}, ("M1", "finite")),
+        ({"D1": np.full((1, 8), 0.1)}, ("D1", 8, "k1 k2 p1 p2 k3")),
+        ({"D1": np.zeros((1, 6))}, ("D1", "(1, 6)", 4, 5, 8, 12, 14)),
+        ({"M2": None}, ("M2", "matrix")),
     ],
 )
 @pytest.mark.filterwarnings("error")  # which NumPy would print beside the message
-def test_what_cannot_be_used_is_named(tmp_path, change, message):
-    entries = {key: value for key, value in {**rig(), **change}.items() if value is not None}
-    with pytest.raises(InputError, match=message):
-        opencv_calibration.read_matrices(read_storage(write(tmp_path / "a.yml", entries)), KEYS)
+def test_what_cannot_be_used_is_named(change, facts):
+    entries = {key: value for key, value in {**rig(), **change}.items() if not isinstance(value, str)}
+    with raises(InputError, "a.yml", *facts):
+        opencv_calibration.read_matrices(Storage("a.yml", entries), KEYS)
 
 
+@pytest.mark.process
+def test_entries_of_a_file_that_cannot_be_used_are_named(tmp_path):
+    storage = read_storage(write(tmp_path / "a.yml", {**rig(), "M1": rig()["M1"] * np.nan, "M2": "words"}))
+    with raises(InputError, "a.yml", "M1", "finite"):
+        opencv_calibration.read_matrices(storage, KEYS)
+    with raises(InputError, "a.yml", "M2", "matrix"):
+        opencv_calibration.read_matrices(storage, ("M2", *KEYS[1:]))
+
+
+@pytest.mark.process
 def test_other_shapes_that_mean_the_same(tmp_path):
     changed = {
         "D1": np.concatenate([rig()["D1"], np.zeros((1, 3))], axis=1).T,
@@ -108,26 +121,42 @@ def test_other_shapes_that_mean_the_same(tmp_path):
     np.testing.assert_allclose(read["R"] @ read["R"].T, np.eye(3), atol=1e-14)
 
 
-@pytest.mark.parametrize("content", ["", "no storage", "%YAML:1.0\n---\nM1: !!opencv-matrix\n   rows: 3"])
-def test_files_that_are_no_storage(tmp_path, content):
-    for suffix in (".yml", ".xml", ".json"):
-        path = tmp_path / f"a{suffix}"
-        path.write_text(content)
-        with pytest.raises(InputError, match=f"a{suffix}"):
-            opencv_calibration.read_matrices(read_storage(path), KEYS)
-    with pytest.raises(InputError):
+NO_STORAGE = ("", "no storage", "%YAML:1.0\n---\nM1: !!opencv-matrix\n   rows: 3")
+SUFFIXES = (".yml", ".xml", ".json")
+
+
+@pytest.mark.process
+@pytest.mark.parametrize(
+    ("content", "suffix"),
+    [
+        pytest.param(content, suffix, marks=[] if i == j else pytest.mark.slow)
+        for i, content in enumerate(NO_STORAGE)
+        for j, suffix in enumerate(SUFFIXES)
+    ],
+)
+def test_files_that_are_no_storage(tmp_path, content, suffix):
+    path = tmp_path / f"a{suffix}"
+    path.write_text(content)
+    with raises(InputError, f"a{suffix}"):
+        opencv_calibration.read_matrices(read_storage(path), KEYS)
+
+
+def test_a_file_or_keys_that_are_missing(tmp_path):
+    with raises(InputError, "absent.yml"):
         opencv_calibration.read_matrices(read_storage(tmp_path / "absent.yml"), KEYS)
-    with pytest.raises(InputError, match=r"\b2\b"):
+    with raises(InputError, "2 keys"):
         opencv_calibration.read_matrices(Storage("a.yml", {}), KEYS[:2])
 
 
+@pytest.mark.process
 def test_a_real_file_in_two_parts(real_data):
-    with pytest.raises(InputError, match=r"intrinsic\.yml.*R, T.*M1, D1, M2, D2"):
+    with raises(InputError, "intrinsic.yml", "R, T", "M1, D1, M2, D2"):
         opencv_calibration.read_matrices(
             read_storage(real_data / "slmaster_david" / "intrinsic.yml"), ("M1", "D1", "M2", "D2", "R", "T")
         )
 
 
+@pytest.mark.process
 @pytest.mark.parametrize(
     ("suffix", "content"),
     [
@@ -143,10 +172,11 @@ def test_a_real_file_in_two_parts(real_data):
 def test_a_file_that_crashes_the_parser_is_refused(tmp_path, suffix, content):
     path = tmp_path / f"a{suffix}"
     path.write_text(content)
-    with pytest.raises(InputError, match=rf"a{suffix}"):
+    with raises(InputError, f"a{suffix}"):
         opencv_calibration.read_matrices(read_storage(path), KEYS)
 
 
+@pytest.mark.process
 def test_other_entries_of_a_file_do_not_matter(tmp_path):
     others = {"points": np.zeros((300, 200)), "M0": np.full((3, 3), np.nan), "note": "M1"}
     storage = read_storage(write(tmp_path / "a.yml", {**others, **rig()}))

@@ -1,10 +1,13 @@
 """An image is read whole or refused by name."""
 
+import errno
+import os
 import struct
 
 import cv2
 import numpy as np
 import pytest
+from facts import raises
 
 from slviewer.errors import InputError
 from slviewer.session.importers.images import read_frames, read_image
@@ -37,7 +40,7 @@ def test_cut_short_images_are_refused(tmp_path, suffix, kept):
     path = tmp_path / "pose_1" / "V" / f"P18_F07{suffix}"
     path.parent.mkdir(parents=True)
     path.write_bytes(data[: int(kept * len(data))])
-    with pytest.raises(InputError, match="pose_1/V/P18_F07"):
+    with raises(InputError, f"pose_1/V/P18_F07{suffix}"):
         read_image(path)
 
 
@@ -62,25 +65,25 @@ def test_a_thumbnail_does_not_end_a_jpeg(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("pixels", "message"),
+    ("pixels", "facts"),
     [
-        (PIXELS[:, :60], "is 60x48 px, .*a.png is 64x48"),
-        (PIXELS.astype(np.uint16) * 257, "has 16 bits, .*a.png has 8"),
-        (np.dstack([PIXELS] * 4), "has 4 channels: .* without alpha"),
+        (PIXELS[:, :60], ("60x48", "a.png", "64x48")),
+        (PIXELS.astype(np.uint16) * 257, ("16 bits", "a.png", 8)),
+        (np.dstack([PIXELS] * 4), ("4 channels", "alpha")),
     ],
 )
-def test_frames_that_differ_are_refused(tmp_path, pixels, message):
+def test_frames_that_differ_are_refused(tmp_path, pixels, facts):
     for name, image in (("a.png", PIXELS), ("b.png", pixels)):
         (tmp_path / name).write_bytes(encoded(".png", image))
-    with pytest.raises(InputError, match=r"b\.png " + message):
+    with raises(InputError, "b.png", *facts):
         read_frames([tmp_path / "a.png", tmp_path / "b.png"])
 
 
 def test_what_is_no_frame_is_refused(tmp_path):
     (tmp_path / "a.png").write_text("no image at all")
     (tmp_path / "b.tif").write_bytes(encoded(".tif", PIXELS.astype(np.float32)))
-    for name, message in (("a.png", "not a readable image"), ("b.tif", "float32"), ("c.png", "cannot be read")):
-        with pytest.raises(InputError, match=message):
+    for name, *facts in (("a.png",), ("b.tif", "float32"), ("c.png", os.strerror(errno.ENOENT))):
+        with raises(InputError, name, *facts):
             read_frames([tmp_path / name])
 
 

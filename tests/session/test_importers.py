@@ -5,6 +5,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from facts import missing_facts, raises
 
 from slviewer.errors import InputError
 from slviewer.fringe import presets
@@ -70,7 +71,8 @@ def test_p18_texture_at_f26_or_nowhere_or_twice(tmp_path):
     _, bare, double = found
     assert [frame.kind for frame in bare.sequence.frames].count("texture") == 0 and len(bare.frames) == 50
     assert (double.frames[25] == 9).all()
-    assert "no texture" in found.warnings[0] and "brighter" in found.warnings[1] and len(found.warnings) == 2
+    assert missing_facts(found.warnings[0], "pose_2", "texture") == [] and len(found.warnings) == 2
+    assert missing_facts(found.warnings[1], "pose_3/V", "F25", "F26") == []
 
 
 def test_p18_in_colour_keeps_the_texture(tmp_path):
@@ -91,8 +93,8 @@ def test_p18_says_what_is_missing_before_it_reads(tmp_path):
     found = p18.LAYOUT.read(tmp_path)
     assert [recording.name for recording in found.recordings] == ["pose_01"]
     (skipped,) = found.skipped
-    assert skipped.name == "pose_03" and "folder V" in skipped.reason and "P18_F07, 08" in skipped.reason
-    with pytest.raises(InputError, match=r"pose_03.*\bV\b.*P18_F07, 08"):
+    assert skipped.name == "pose_03" and missing_facts(skipped.reason, "V", "P18_F07, 08") == []
+    with raises(InputError, "pose_03", "V", "P18_F07, 08"):
         p18.LAYOUT.read(tmp_path / "pose_03")
 
 
@@ -101,13 +103,14 @@ def test_p18_refuses_extra_and_double_frames_and_warns_of_strangers(tmp_path):
     (tmp_path / "pose_1/V/Thumbs.db").touch()
     (tmp_path / "notes").mkdir()
     found = p18.LAYOUT.read(tmp_path)
-    assert "notes" in found.warnings[0] and "pose_1/V: Thumbs.db" in found.warnings[1] and len(found.warnings) == 2
+    assert missing_facts(found.warnings[0], "notes") == [] and len(found.warnings) == 2
+    assert missing_facts(found.warnings[1], "pose_1/V", "Thumbs.db") == []
     write(tmp_path / "pose_1/H/P18_F31.PNG", image(0))
-    with pytest.raises(InputError, match=r"pose_1.*\bH\b.*P18_F31\.PNG"):
+    with raises(InputError, "pose_1", "H", "P18_F31.PNG"):
         p18.LAYOUT.read(tmp_path)
     (tmp_path / "pose_1/H/P18_F31.PNG").unlink()
     write(tmp_path / "pose_1/H/P18_F03.bmp", image(0))
-    with pytest.raises(InputError, match=r"P18_F03\.PNG.*P18_F03\.bmp"):
+    with raises(InputError, "P18_F03.PNG", "P18_F03.bmp"):
         p18.LAYOUT.read(tmp_path)
 
 
@@ -131,14 +134,14 @@ def test_an_error_states_each_reason_once(tmp_path):
     with pytest.raises(InputError) as refused:
         procam_calibration.LAYOUT.read(tmp_path)
     message = str(refused.value)
-    assert "5 captures" in message and message.count("40 images") == 1
-    assert message.count("holds 39 images") == 1 and "capture_0, capture_1, capture_2" in message
+    assert message.count("40 images") == message.count("39 images") == 1
+    assert missing_facts(message, "5 captures", "capture_0, capture_1, capture_2") == []
 
 
 def test_p18_seven_bits_cannot_number_every_projector(tmp_path):
     write_p18(tmp_path / "pose_1", "V")
     assert len(p18.LAYOUT.read(tmp_path, projector=(2304, 4000))) == 1  # only x is there
-    with pytest.raises(InputError, match=r"2304.*2305.*\bx\b"):
+    with raises(InputError, 2304, 2305, "x"):
         p18.LAYOUT.read(tmp_path, projector=(2305, 100))
 
 
@@ -160,22 +163,22 @@ def test_procam_calibration(tmp_path):
 def test_procam_calibration_counts(tmp_path):
     write_procam(tmp_path / "capture_0")
     assert len(procam_calibration.LAYOUT.read(tmp_path, projector=(800, 600))) == 1
-    with pytest.raises(InputError, match=r"42 .*1920x1080.*46"):
+    with raises(InputError, "42 images", "1920x1080", 46):
         procam_calibration.LAYOUT.read(tmp_path, projector=(1920, 1080))
-    with pytest.raises(InputError, match="38"):
+    with raises(InputError, "42 images", "512x512", 38):
         procam_calibration.LAYOUT.read(tmp_path, projector=(512, 512))
     (tmp_path / "capture_0/graycode_17.png").unlink()
-    with pytest.raises(InputError, match=r"capture_0.*graycode_17"):
+    with raises(InputError, "capture_0", "graycode_17"):
         procam_calibration.LAYOUT.read(tmp_path)
 
 
 @pytest.mark.parametrize(
     ("form", "first", "missing", "named"),
     [
-        ("{:04d}", 1, 3, "shot_0003:"),
-        ("{:04d}", 1, 6, "shot_0006:"),
-        ("{}", 0, 2, "shot_2:"),
-        ("{:02d}", 0, 0, "shot_00:"),
+        ("{:04d}", 1, 3, "shot_0003"),
+        ("{:04d}", 1, 6, "shot_0006"),
+        ("{}", 0, 2, "shot_2"),
+        ("{:02d}", 0, 0, "shot_00"),
     ],
 )
 def test_missing_images_are_named_as_the_others(form, first, missing, named):
@@ -184,7 +187,7 @@ def test_missing_images_are_named_as_the_others(form, first, missing, named):
     check_complete(images, "shot_", 6, first=first)
     check_complete(images, "shot_", first=first)
     del images[(missing,)]
-    with pytest.raises(InputError, match=f"lacks {named}"):
+    with raises(InputError, named):
         check_complete(images, "shot_", 6, first=first)
 
 
@@ -258,33 +261,33 @@ def test_frames_are_what_the_toml_says(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("edit", "message"),
+    ("edit", "facts"),
     [
-        (lambda t: t.replace("96x64", "96"), "'96' is no size"),
-        (lambda t: 'channel = "grey"\n' + t, "channel is 'grey'"),
-        (lambda t: 'order = "time"\n' + t, "order is 'time'"),
-        (lambda t: 'order = "name"\n' + t, r"\[\[frame\]\] 1 names files, and order"),
-        (lambda t: t.replace("step = 1", "step = 1\nexposure_ms = 4"), "3 of 4 images state no exposure_ms"),
-        (lambda t: t + '\n[[frames]]\nkind = "white"\nfiles = "w.png"', "use one of the two"),
-        (lambda t: t.replace('"c.png"', '"../c.png"'), "outside of the capture's folder"),
-        (lambda t: t.replace("projector =", "projectr ="), "unknown entry 'projectr'"),
-        (lambda t: t.replace('kind = "white"', 'kind = "blue"'), r"\[\[frame\]\] 4 \(white.png\): .*'blue'"),
-        (lambda t: t.replace('kind = "white"', 'kind = ["white"]'), "kind must be a word"),
-        (lambda t: t.replace("step = 1", "stp = 1"), r"\[\[frame\]\] 2 \(sub/b.png\): .*'stp'"),
-        (lambda t: t.replace("step = 1", 'step = "one"'), "no number"),
-        (lambda t: t.replace("step = 1", "step = 0"), "phase step 1 of 3 is missing"),
-        (lambda t: t.replace('file = "c.png"', ""), r"\[\[frame\]\] 3 names no file"),
-        (lambda t: t.replace("c.png", "d.png"), "capture: it lacks d.png"),
-        (lambda t: t.replace("[[frame]]", "[frame]", 1), "is not TOML .*line"),
-        (lambda t: t.replace('"a.png"', '"a.png'), "is not TOML .*line 5"),
-        (lambda t: 'projector = "96x64"', "names no frames"),
-        (lambda t: 'projector = "96x64"\nframe = 3', "names no frames"),
-        (lambda t: 'projector = "96x64"\nframe = [3]', r"\[\[frame\]\] 1 is no table"),
+        (lambda t: t.replace("96x64", "96"), ("'96'", "912x1140")),
+        (lambda t: 'channel = "grey"\n' + t, ("channel", "'grey'", "luma")),
+        (lambda t: 'order = "time"\n' + t, ("order", "'time'", '"name"')),
+        (lambda t: 'order = "name"\n' + t, ("[[frame]] 1", 'order = "name"')),
+        (lambda t: t.replace("step = 1", "step = 1\nexposure_ms = 4"), ("3 of 4", "exposure_ms")),
+        (lambda t: t + '\n[[frames]]\nkind = "white"\nfiles = "w.png"', ("[[frame]]", "[[frames]]")),
+        (lambda t: t.replace('"c.png"', '"../c.png"'), ("[[frame]] 3", '"../c.png"')),
+        (lambda t: t.replace("projector =", "projectr ="), ("'projectr'", "projector")),
+        (lambda t: t.replace('kind = "white"', 'kind = "blue"'), ("[[frame]] 4", "white.png", "'blue'")),
+        (lambda t: t.replace('kind = "white"', 'kind = ["white"]'), ("[[frame]] 4", "white.png", "kind", "['white']")),
+        (lambda t: t.replace("step = 1", "stp = 1"), ("[[frame]] 2", "sub/b.png", "'stp'")),
+        (lambda t: t.replace("step = 1", 'step = "one"'), ("[[frame]] 2", "sub/b.png", "phase", "number")),
+        (lambda t: t.replace("step = 1", "step = 0"), ("phase step 1 of 3",)),
+        (lambda t: t.replace('file = "c.png"', ""), ("[[frame]] 3", "file")),
+        (lambda t: t.replace("c.png", "d.png"), ("capture", "d.png")),
+        (lambda t: t.replace("[[frame]]", "[frame]", 1), ("TOML", "line")),
+        (lambda t: t.replace('"a.png"', '"a.png'), ("TOML", "line 5")),
+        (lambda t: 'projector = "96x64"', ("[[frame]]", "[[frames]]")),
+        (lambda t: 'projector = "96x64"\nframe = 3', ("[[frame]]", "[[frames]]")),
+        (lambda t: 'projector = "96x64"\nframe = [3]', ("[[frame]] 1", "table")),
     ],
 )
-def test_frames_toml_faults_are_named(tmp_path, edit, message):
+def test_frames_toml_faults_are_named(tmp_path, edit, facts):
     toml = write_frames(tmp_path, edit=edit)
-    with pytest.raises(InputError, match=message):
+    with raises(InputError, *facts):
         frames_layout.read(tmp_path, toml)
 
 
@@ -294,7 +297,7 @@ def test_frames_projector_given_beside_the_toml(tmp_path):
     assert frames_layout.read(tmp_path, toml).recordings[0].sequence.projector_size is None
     toml = write_frames(tmp_path)
     frames_layout.read(tmp_path, toml, projector=(96, 64))
-    with pytest.raises(InputError, match=r"96x64.*912x1140"):
+    with raises(InputError, "96x64", "912x1140"):
         frames_layout.read(tmp_path, toml, projector=(912, 1140))
     with pytest.raises(InputError):
         frames_layout.read(tmp_path, tmp_path / "absent.toml")
@@ -346,7 +349,7 @@ def test_groups_take_their_files_by_pattern_in_natural_order(tmp_path):
         ("gray", 0), ("inverse", 0), ("gray", 1), ("inverse", 1), ("white", 0)
     ]  # fmt: skip
     (tmp_path / "capture" / "fringe_8.png").unlink()
-    with pytest.raises(InputError, match=r'5 files match "fringe_\*.png".*\(phase x\) describes 6'):
+    with raises(InputError, "5 files", '"fringe_*.png"', "[[frames]] 1", "phase x", "6 images"):
         frames_layout.read(tmp_path, toml)
 
 
@@ -358,7 +361,7 @@ def test_groups_in_order_of_the_names(tmp_path):
     (capture,) = frames_layout.read(tmp_path, toml)
     np.testing.assert_array_equal(capture.frames, [image(seed) for seed in range(11)])
     write(tmp_path / "capture" / "preview.png", image(0))
-    with pytest.raises(InputError, match=r"12.*11"):
+    with raises(InputError, "12 images", 11):
         frames_layout.read(tmp_path, toml)
 
 
@@ -379,22 +382,22 @@ def test_gray_groups(tmp_path, text, kinds):
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "message"),
+    ("old", "new", "facts"),
     [
-        ("bits = 2", "bits = 0", r"2 \(gray y\): .*bits"),
-        ("bits = 2", "bit = 2", "unknown field `bit`"),
-        ("steps = 3", "steps = 2", r"\(phase x\): .*steps"),
-        ("16.0]", '"16"]', "str.*period_px"),
-        ("inverse = true", "inverse = 1", "bool.*inverse"),
-        ('files = ["white.png"]', 'files = ["a.png", "b.png"]', "names 2 files and describes 1 images"),
-        ('kind = "white"', 'kind = "flat"', "'flat'.*kind"),
-        ('files = "fringe_*.png"', "", r"\[\[frames\]\] 1 \(phase x\) names no file"),
-        ('files = ["white.png"]', 'files = "fringe_6.*"', "fringe_6.png would show two patterns"),
+        ("bits = 2", "bits = 0", ("[[frames]] 2", "gray y", "bits")),
+        ("bits = 2", "bit = 2", ("[[frames]] 2", "gray y", "bit")),
+        ("steps = 3", "steps = 2", ("[[frames]] 1", "phase x", "steps")),
+        ("16.0]", '"16"]', ("[[frames]] 1", "str", "period_px")),
+        ("inverse = true", "inverse = 1", ("[[frames]] 2", "bool", "inverse")),
+        ('files = ["white.png"]', 'files = ["a.png", "b.png"]', ("[[frames]] 3", "2 files", "1 images")),
+        ('kind = "white"', 'kind = "flat"', ("[[frames]] 3", "'flat'", "kind")),
+        ('files = "fringe_*.png"', "", ("[[frames]] 1", "phase x", "file")),
+        ('files = ["white.png"]', 'files = "fringe_6.*"', ("fringe_6.png", "two patterns")),
     ],
 )
-def test_faults_in_groups_are_named(tmp_path, old, new, message):
+def test_faults_in_groups_are_named(tmp_path, old, new, facts):
     toml = write_groups(tmp_path, [*GROUP_FILES, "white.png"], GROUPS.format(top="").replace(old, new))
-    with pytest.raises(InputError, match=message):
+    with raises(InputError, *facts):
         frames_layout.read(tmp_path, toml)
 
 
@@ -411,7 +414,7 @@ def test_brackets_of_exposures_become_one_capture(tmp_path):
     longest = capture.frames[:3].max(0) < 255
     np.testing.assert_array_equal(capture.merged_frames(), np.where(longest, capture.frames[:3], capture.frames[3:]))
     (tmp_path / "sequence.toml").write_text(text.replace("steps = 3", "steps = 4", 1))
-    with pytest.raises(InputError, match="20 and 5 ms"):
+    with raises(InputError, 20, "5 ms"):
         frames_layout.read(tmp_path, tmp_path / "sequence.toml")
     (tmp_path / "sequence.toml").write_text(text[: text.rindex("[[")])
     (capture,) = frames_layout.read(tmp_path, tmp_path / "sequence.toml")

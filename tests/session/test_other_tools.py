@@ -5,6 +5,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from facts import raises
 
 from slviewer.errors import InputError
 from slviewer.fringe.decode import decode
@@ -55,6 +56,7 @@ def slstudio_frames(codec: str) -> list[np.ndarray]:
     return frames or cosines(int(codec), COLUMNS, U)
 
 
+@pytest.mark.computes
 @pytest.mark.parametrize(
     ("codec", "least", "most"),
     [("2x3", 0.0, 0.3), ("nstep", 0.0, 0.3), ("3", 0.1, 3.0), ("4", 0.1, 3.0), ("gray", 0.0, 0.6)],
@@ -75,23 +77,24 @@ def test_slstudio_codecs_give_the_projectors_pixels(tmp_path, codec, least, most
 def test_slstudio_frames_that_fit_several_codecs_need_its_name(tmp_path):
     for number, pattern in enumerate(slstudio_frames("2x3")):
         write(tmp_path / f"frameSeq_{number:02d}.bmp", pattern)
-    with pytest.raises(InputError, match=r"12 .*2x3.*nstep.*gray"):
+    with raises(InputError, "12 frames", "2x3", "nstep", "gray", "--codec"):
         slstudio.LAYOUT.read(tmp_path, projector=SIZE)
-    with pytest.raises(InputError, match="--projector"):
+    with raises(InputError, "--projector"):
         slstudio.LAYOUT.read(tmp_path, codec="2x3")
     for number in range(3):
         write(tmp_path / "three" / f"frameSeq_{number}.bmp", cosines(3, COLUMNS, U)[number])
-    with pytest.raises(InputError, match=r"\b3 .*2p1.*--codec"):
+    with raises(InputError, "3 frames", "2p1", "--codec"):
         slstudio.LAYOUT.read(tmp_path / "three", projector=SIZE)
     (tmp_path / "frameSeq_07.bmp").unlink()
-    with pytest.raises(InputError, match="frameSeq_07"):
+    with raises(InputError, "frameSeq_07"):
         slstudio.LAYOUT.read(tmp_path, projector=SIZE)
     for number in (8, 9, 10, 11):
         (tmp_path / f"frameSeq_{number:02d}.bmp").unlink()
-    with pytest.raises(InputError, match=r"\b7\b"):
+    with raises(InputError, "7 frames", "--codec"):
         slstudio.LAYOUT.read(tmp_path, projector=SIZE)
 
 
+@pytest.mark.computes
 @pytest.mark.parametrize("shadow", [True, False])
 def test_opencv_generates_columns_then_rows_each_with_its_inverse(tmp_path, shadow):
     patterns = [
@@ -108,19 +111,18 @@ def test_opencv_generates_columns_then_rows_each_with_its_inverse(tmp_path, shad
     for axis in ("x", "y"):
         assert np.abs(decoded_error(capture, axis)).max() < 0.5
     write(tmp_path / "scan" / "pattern_cam2_im1.png", U / COLUMNS)
-    with pytest.raises(
-        InputError, match='pattern_cam1_imN, pattern_cam2_imN: choose one with --files "pattern_cam1_im'
-    ):
+    with raises(InputError, "pattern_cam1_imN", "pattern_cam2_imN", '--files "pattern_cam1_im'):
         opencv_graycode.read(tmp_path, projector=SIZE)
     found = opencv_graycode.read(tmp_path, projector=SIZE, files="pattern_cam1_*")
     assert len(found) == 1 and "pattern_cam2_im1.png" in found.warnings[0]
     other = (2000, ROWS) if shadow else (COLUMNS, 60)  # as many images as another projector without, or with them
     with pytest.raises(InputError):
         opencv_graycode.read(tmp_path, projector=other, files="pattern_cam1_*")
-    with pytest.raises(InputError, match=f"{len(patterns)} .*4000x120.*40"):
+    with raises(InputError, f"{len(patterns)} images", "4000x120", 40):
         opencv_graycode.read(tmp_path, projector=(4000, ROWS), files="pattern_cam1_*")
 
 
+@pytest.mark.computes
 def test_sltk_names_say_axis_bit_and_negative(tmp_path):
     number = 0
     for axis, (at, bits) in enumerate(((U, 10), (V, 7))):
@@ -138,22 +140,22 @@ def test_sltk_names_say_axis_bit_and_negative(tmp_path):
     for axis in ("x", "y"):
         assert np.abs(decoded_error(capture, axis)).max() < 0.5
     next((tmp_path / "scan").glob("*[[]00-05-01*")).unlink()
-    with pytest.raises(InputError, match="4 of 10"):
+    with raises(InputError, "4 of 10"):
         sltk.LAYOUT.read(tmp_path, projector=SIZE)
 
 
 def test_a_layout_is_detected_or_the_known_ones_are_listed(tmp_path):
-    with pytest.raises(InputError, match="sltk"):
+    with raises(InputError, "sltk"):
         layouts.detect_layout(tmp_path)
     write(tmp_path / "a" / "graycode_00.png", U / COLUMNS)
     assert layouts.detect_layout(tmp_path) == "procam-calibration"
     write(tmp_path / "b" / "frameSeq_0.bmp", U / COLUMNS)
-    with pytest.raises(InputError, match=r"procam-calibration.*slstudio"):
+    with raises(InputError, "procam-calibration", "slstudio"):
         layouts.detect_layout(tmp_path)
     (tmp_path / "frames.toml").touch()
     assert layouts.detect_layout(tmp_path) == "frames"
     (tmp_path / "more.toml").touch()
-    with pytest.raises(InputError, match=r"frames\.toml.*more\.toml"):
+    with raises(InputError, "frames.toml", "more.toml"):
         layouts.detect_layout(tmp_path)
 
 

@@ -12,6 +12,7 @@ from slviewer.session.importers import frames as frames_layout
 PROJECTOR = (120, 90)
 
 
+@pytest.mark.computes
 @pytest.mark.parametrize("preset", list(PRESETS))
 def test_a_camera_that_sees_the_patterns_themselves_decodes_its_own_pixels(tmp_path, preset):
     sequence = PRESETS[preset](PROJECTOR)

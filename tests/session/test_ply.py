@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from facts import raises
 
 from slviewer.errors import InputError, SlviewerError
 from slviewer.session.ply import read_ply, write_ply
@@ -80,23 +81,23 @@ def test_what_is_not_known_is_no_nan_in_the_file(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "words"),
+    ("arguments", "facts"),
     [
-        ({"points": np.zeros((2, 3, 3))}, "select the valid"),
-        ({"points": np.full((2, 3), np.nan)}, "NaN"),
-        ({"colours": COLOURS[:10]}, "50 points"),
-        ({"colours": COLOURS / 255}, "uint8"),
-        ({"normals": NORMALS[:, :2]}, "50 points"),
-        ({"scalars": {"a b": SIGMA}}, "property"),
-        ({"scalars": {"x": SIGMA}}, "property"),
-        ({"scalars": {"a": SIGMA[:3]}}, "50 points"),
-        ({"scalars": {"deviation": np.full(50, np.nan)}}, "deviation is not known of 50 points"),
-        ({"faces": [[0, 1, 50]]}, "below 50"),
-        ({"faces": [[0, 1]]}, r"\(m, 3\)"),
+        ({"points": np.zeros((2, 3, 3))}, ("(2, 3, 3)", "(n, 3)")),
+        ({"points": np.full((2, 3), np.nan)}, ("NaN",)),
+        ({"colours": COLOURS[:10]}, ("colours", "(10, 3)", "50 points")),
+        ({"colours": COLOURS / 255}, ("colours", "float64", "uint8")),
+        ({"normals": NORMALS[:, :2]}, ("normals", "(50, 2)", "50 points")),
+        ({"scalars": {"a b": SIGMA}}, ("'a b'", "property")),
+        ({"scalars": {"x": SIGMA}}, ("'x'", "property")),
+        ({"scalars": {"a": SIGMA[:3]}}, ("a", "(3,)", "50 points")),
+        ({"scalars": {"deviation": np.full(50, np.nan)}}, ("deviation", "50 points")),
+        ({"faces": [[0, 1, 50]]}, ("(1, 3)", "below 50")),
+        ({"faces": [[0, 1]]}, ("(1, 2)", "(m, 3)")),
     ],
 )
-def test_what_does_not_fit_is_refused(tmp_path: Path, arguments: dict, words: str) -> None:
-    with pytest.raises(InputError, match=words):
+def test_what_does_not_fit_is_refused(tmp_path: Path, arguments: dict, facts: tuple[str, ...]) -> None:
+    with raises(InputError, *facts):
         write_ply(tmp_path / "a.ply", **{"points": POINTS, **arguments})
     assert not list(tmp_path.iterdir())
 
@@ -123,15 +124,15 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError):
         read_ply(path)
     path.write_text("ply\nformat ascii 1.0\nelement vertex 0\nend_header\n")
-    with pytest.raises(InputError, match="little-endian"):
+    with raises(InputError, "a.ply", "little-endian"):
         read_ply(path)
     path.write_bytes(b"")
-    with pytest.raises(InputError, match="little-endian"):
+    with raises(InputError, "a.ply", "little-endian"):
         read_ply(path)
     write_ply(path, POINTS)
     path.write_bytes(path.read_bytes()[:-5])
     with pytest.raises(InputError):
         read_ply(path)
     path.write_bytes(b"ply\nformat binary_little_endian 1.0\nelement vertex 0\nproperty short q\nend_header\n")
-    with pytest.raises(InputError, match=r"\bq\b"):
+    with raises(InputError, "a.ply", "q"):
         read_ply(path)

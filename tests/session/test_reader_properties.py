@@ -41,13 +41,28 @@ from slviewer.simulation.assets import asset_folder
 
 settings.register_profile(
     "readers",
-    max_examples=40,
     deadline=None,
     derandomize=True,
     database=None,
     suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
 )
 settings.load_profile("readers")
+
+FEW, MANY = 8, 80
+"""Examples of each law: by default, and in the slow tier."""
+
+
+def law(few: int = FEW, many: int = MANY, **drawn: st.SearchStrategy[Any]) -> Callable[[Callable[..., None]], Any]:
+    """Decorate a test of drawn values: it is run on few examples, and a slow test of its name and `_often` on many."""
+
+    def decorate(check: Callable[..., None]) -> Any:
+        """Return the test of few examples, and define the other one."""
+        often = settings(max_examples=many)(given(**drawn)(check))
+        globals()[f"{check.__name__}_often"] = pytest.mark.slow(often)
+        return settings(max_examples=few)(given(**drawn)(check))
+
+    return decorate
+
 
 _TEXTS = st.text(max_size=8) | st.sampled_from(["\x1b[2J", "\u202e", "~nobody", "../x", "9" * 500])
 _NUMBERS = st.floats() | st.integers() | st.sampled_from([10**30, 2**63, -1, 1e308, float("nan"), float("inf")])
@@ -130,8 +145,8 @@ _RECORDS: dict[str, Callable[[Session], object]] = {
 _LISTED = {"changes": [["results/measurements/m1", None, "trash/m1"], ["results/a", "results/.a.tmp-1-ab", None]]}
 
 
+@law(data=st.data())
 @pytest.mark.parametrize("name", _RECORDS)
-@given(data=st.data())
 def test_a_damaged_record_is_refused_or_typed(full: Session, name: str, data: st.DataObject) -> None:
     path = full.folder / name
     sound = path.read_bytes()
@@ -144,7 +159,7 @@ def test_a_damaged_record_is_refused_or_typed(full: Session, name: str, data: st
         path.write_bytes(sound)
 
 
-@given(data=st.data())
+@law(data=st.data())
 def test_a_damaged_array_is_refused_or_read(full: Session, data: st.DataObject) -> None:
     path = full.folder / "results/measurements/m1/arrays/K.npy"
     sound = path.read_bytes()
@@ -154,7 +169,7 @@ def test_a_damaged_array_is_refused_or_read(full: Session, data: st.DataObject) 
     path.write_bytes(sound)
 
 
-@given(data=st.data())
+@law(data=st.data())
 def test_a_damaged_list_of_changes_is_finished_or_discarded(tmp_path: Path, data: st.DataObject) -> None:
     """And nothing beside the session changes."""
     folder = Path(tempfile.mkdtemp(dir=tmp_path)) / "session"
@@ -167,7 +182,7 @@ def test_a_damaged_list_of_changes_is_finished_or_discarded(tmp_path: Path, data
     assert not list(folder.glob(".together*")) and len(list(folder.parent.iterdir())) == 2
 
 
-@given(data=_damaged({"shape": [4, 6, 8]}))
+@law(data=_damaged({"shape": [4, 6, 8]}))
 def test_a_stack_is_never_larger_than_its_files(full: Session, data: Any) -> None:
     path = full.folder / "captures/scan/frames.zarr/zarr.json"
     sound = path.read_text()
@@ -199,8 +214,8 @@ _TABLES: dict[str, tuple[dict[str, Any], Callable[[Path], object]]] = {
 }
 
 
+@law(data=st.data())
 @pytest.mark.parametrize("name", _TABLES)
-@given(data=st.data())
 def test_a_damaged_table_is_refused_or_typed(tmp_path: Path, name: str, data: st.DataObject) -> None:
     sound, read = _TABLES[name]
     path = tmp_path / "table.toml"
@@ -225,8 +240,8 @@ def _to_toml(values: Any) -> bytes:
     return "".join(f"{format_value(key)} = {format_value(value)}\n" for key, value in table.items()).encode()
 
 
+@law(data=st.data())
 @pytest.mark.parametrize("kind", ["ply", "stl", "obj", "png", "tif", "nominal.ply"])
-@given(data=st.data())
 def test_a_damaged_file_of_points_or_pixels_is_refused_or_read(tmp_path: Path, kind: str, data: st.DataObject) -> None:
     path = tmp_path / f"file.{kind}"
     points = np.array([[0, 0, 0], [9, 0, 0], [0, 9, 0], [0, 0, 9]], np.float32)
@@ -255,7 +270,7 @@ _CERTIFIED = {
 }
 
 
-@given(data=st.data())
+@law(data=st.data())
 def test_a_damaged_certificate_is_refused_or_typed(tmp_path: Path, data: st.DataObject) -> None:
     def page(values: Any) -> bytes:
         """Return a page with these values as its certificate."""
@@ -282,10 +297,11 @@ def _make_sound_file(kind: str) -> bytes:
         return path.read_bytes()
 
 
-@pytest.mark.computes
-@pytest.mark.parametrize("kind", ["yml", "json", "step", "3mf"])
-@settings(max_examples=5)
-@given(data=st.data())
+@law(few=2, many=5, data=st.data())
+@pytest.mark.process
+@pytest.mark.parametrize(
+    "kind", ["yml", "json", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("step", "3mf"))]
+)
 def test_a_damaged_file_that_another_process_parses_is_refused_or_read(
     tmp_path: Path, kind: str, data: st.DataObject
 ) -> None:

@@ -2,17 +2,21 @@
 
 import json
 import os
-import time
+from collections import Counter
+from pathlib import Path
 
 import numpy as np
 import pytest
+from facts import raises
 
 from slviewer import terminal
 from slviewer.errors import DamagedError, InputError, SlviewerError
 from slviewer.fringe.sequence import PatternSequence, parse_size
+from slviewer.session import store
 from slviewer.session.names import clean_label
 from slviewer.session.nominal import read_nominal
 from slviewer.session.reading import MAX_TOML_BYTES, expand_user, read_file, read_json, read_toml
+from slviewer.session.results import read_meta
 
 FAR_TOO_DEEP = ("[" * 100_000, '{"a":' * 100_000, '{"a": ' + "[" * 50 + "]" * 50 + "}", '{"a": 1' + "0" * 5000 + "}")
 FOREIGN = (None, True, -1, 1e308, float("inf"), 10**30, "x", "", [], {}, [[]], [None], {"a": {}}, [1.5] * 3)
@@ -32,14 +36,12 @@ def test_only_regular_files_of_limited_size_are_read(tmp_path, kind):
     elif kind == "sparse":
         with path.open("wb") as file:
             file.truncate(3 << 30)
-    started = time.monotonic()
     with pytest.raises(OSError):
         read_file(path, MAX_TOML_BYTES)
     with pytest.raises(InputError):
         read_toml(path)
     with pytest.raises(DamagedError):
         read_json(path)
-    assert time.monotonic() - started < 60
 
 
 @pytest.mark.parametrize(
@@ -58,12 +60,12 @@ def test_values_that_no_record_has_are_refused(tmp_path, text):
 def test_containers_without_end_are_refused_before_they_take_memory(tmp_path, element):
     path = tmp_path / "file.json"
     path.write_text('{"a": [' + f"{element}," * (25_000_000 // len(element)) + "0]}")
-    with pytest.raises(DamagedError, match="MB"):
+    with raises(DamagedError, "file.json", "MB"):
         read_json(path)
 
 
 def test_a_user_that_does_not_exist_is_named():
-    with pytest.raises(InputError, match="nobody-of-that-name"):
+    with raises(InputError, "~nobody-of-that-name/x"):
         expand_user("~nobody-of-that-name/x")
 
 
@@ -83,7 +85,7 @@ def test_an_entry_of_another_type_is_damage(session, key, value):
 
 def test_an_entry_that_is_missing_is_damage(session):
     session.save_result("merge/1", {}, {})
-    with pytest.raises(DamagedError, match="scans"):
+    with raises(DamagedError, "merge/1", "'scans'"):
         session.load_result("merge/1")[0]["scans"]
 
 
@@ -94,9 +96,10 @@ def test_inputs_that_form_a_circle_or_many_paths_are_examined_once(session, monk
         session.save_result(name, {"inputs": inputs}, {})
         session.save_result(f"{name}b", {"inputs": inputs}, {})
         session.save_result(name, {"inputs": session.input_hashes(f"{name}b") | inputs}, {})
-    started = time.monotonic()
+    examined: Counter[Path] = Counter()
+    monkeypatch.setattr(store, "read_meta", lambda folder: examined.update([folder]) or read_meta(folder))
     assert session.state_of(names[-1]) in ("fresh", "stale")
-    assert time.monotonic() - started < 60
+    assert set(examined.values()) == {1}
     path = session.folder / "results/made/n0/meta.json"
     meta = json.loads(path.read_text())
     path.write_text(json.dumps({**meta, "inputs": {"made/n0b": "x", "made/n29": "y"}}))
@@ -120,7 +123,7 @@ def test_decisions_are_of_their_types(session, key, value):
     if (key, value) in (("model", "x"), ("rig", {"x": 3})):
         assert session.decision(key) == value
         return
-    with pytest.raises(DamagedError, match="decisions"):
+    with raises(DamagedError, "decisions.json", key):
         session.decision(key)
 
 

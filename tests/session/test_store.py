@@ -3,6 +3,7 @@
 import json
 import os
 import shutil
+import socket
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -11,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import zarr
+from facts import missing_facts, raises
 
 from slviewer.errors import Cancelled, InputError, SessionError
 from slviewer.fringe.sequence import Frame
@@ -64,30 +66,30 @@ def test_names_are_counted_and_safe(session, sequence, frames):
     for name in ("", "a/b", "../a", ".hidden", "a b", "-a", "a.", "é", "a\n", "x" * 200):
         with pytest.raises(InputError):
             session.save_capture(name, "scan", sequence, frames, source="")
-    with pytest.raises(InputError, match="flat, pose_2, pose_10"):
+    with raises(InputError, "'pose_3'", "flat, pose_2, pose_10"):
         session.load_capture("pose_3")
 
 
 @pytest.mark.parametrize(
-    ("role", "bad", "texture", "message"),
+    ("role", "bad", "texture", "facts"),
     [
-        ("scan", lambda frames: frames[:3], None, "3 frames for a sequence of 4"),
-        ("scan", lambda frames: frames[0], None, "stack of frames"),
-        ("scan", lambda frames: frames.astype(np.float32), None, "float32"),
-        ("scan", lambda frames: frames[:, :0], None, "stack of frames"),
-        ("pose", lambda frames: frames, None, "role 'pose'"),
-        ("scan", lambda frames: frames, np.zeros((30, 40), np.uint8), "colour texture"),
+        ("scan", lambda frames: frames[:3], None, ("3 frames", 4)),
+        ("scan", lambda frames: frames[0], None, ("(n, h, w)", "(30, 40)")),
+        ("scan", lambda frames: frames.astype(np.float32), None, ("float32", "uint8", "uint16")),
+        ("scan", lambda frames: frames[:, :0], None, ("(n, h, w)", "(4, 0, 40)")),
+        ("pose", lambda frames: frames, None, ("'pose'", "'calibration'", "'scan'")),
+        ("scan", lambda frames: frames, np.zeros((30, 40), np.uint8), ("texture", "(30, 40, 3)", "(30, 40)")),
     ],
 )
-def test_frames_that_do_not_fit_are_refused(session, sequence, frames, role, bad, texture, message):
-    with pytest.raises(InputError, match=message):
+def test_frames_that_do_not_fit_are_refused(session, sequence, frames, role, bad, texture, facts):
+    with raises(InputError, *facts):
         session.save_capture("a", role, sequence, bad(frames), source="", texture=texture)
     assert session.capture_names() == [] and not list((session.folder / "captures").iterdir())
 
 
 def test_a_taken_name_is_refused_and_the_replaced_capture_is_in_the_trash(session, sequence, frames):
     first = session.save_capture("a", "scan", sequence, frames, source="")
-    with pytest.raises(InputError, match="--force"):
+    with raises(InputError, "'a'", "--force"):
         session.save_capture("a", "scan", sequence, frames[::-1], source="")
     np.testing.assert_array_equal(first.frames, frames)
     session.save_capture("a", "scan", sequence, frames[::-1], source="", force=True)
@@ -158,7 +160,7 @@ def test_damage_is_an_error_and_never_a_black_frame(session, sequence, frames, d
 def test_frames_outside_the_stack_are_refused(session, sequence, frames):
     capture = session.save_capture("a", "scan", sequence, frames, source="")
     for index in (-1, 4):
-        with pytest.raises(InputError, match="4 frames: count from 0"):
+        with raises(InputError, f"[{index}]", "4 frames"):
             capture.stack([index])
     assert capture.stack([]).shape == (0, 30, 40)
 
@@ -184,7 +186,7 @@ def test_results_come_back_and_replace_each_other(session):
     assert [path.name for path in (session.folder / "results/calibration").iterdir()] == ["pixelwise"]
     with pytest.raises(InputError):
         session.load_result("calibration/pixelwise", only=["y"])
-    with pytest.raises(InputError, match="calibration/pixelwise"):
+    with raises(InputError, "'calibration/stereo'", "calibration/pixelwise"):
         session.load_result("calibration/stereo")
     for name in ("calibration", "calibration/pixelwise/more", "../a", "calibration//a"):
         with pytest.raises(InputError):
@@ -220,7 +222,7 @@ def test_a_result_is_stale_when_any_of_its_inputs_is(session, sequence, frames):
     assert [session.state_of(name) for name in results] == ["fresh", "stale", "fresh"]
     session.trash_capture("pose_1")
     assert session.state_of("calibration/stereo") == "stale"
-    with pytest.raises(InputError, match="pose_1"):
+    with raises(InputError, "'pose_1'"):
         session.input_hashes("pose_1")
 
 
@@ -269,9 +271,10 @@ def test_work_that_was_given_up_saves_nothing(session, sequence, frames):
     assert [p.name for p in (session.folder / "results").iterdir() if p.name.startswith(".")] == []
 
 
+@pytest.mark.process
 def test_one_writer_and_any_number_of_readers(session, sequence, frames):
     session.save_capture("a", "scan", sequence, frames, source="")
-    with pytest.raises(SessionError, match=r"process \d+ on"):
+    with raises(SessionError, session.folder, f"process {os.getpid()}", socket.gethostname()):
         Session.open(session.folder, write=True)
     code = f"""
 import sys
@@ -284,7 +287,7 @@ except SessionError as error:
     print(error)
 """
     said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    assert said.startswith("4\n") and f"process {os.getpid()} on" in said
+    assert said.startswith("4\n") and missing_facts(said, f"process {os.getpid()}", socket.gethostname()) == []
     reader = Session.open(session.folder)
     for change in (
         lambda: reader.save_capture("b", "scan", sequence, frames, source=""),
@@ -302,7 +305,7 @@ except SessionError as error:
 
 
 def test_folders_that_are_no_session(tmp_path):
-    with pytest.raises(SessionError, match="slviewer import"):
+    with raises(SessionError, tmp_path, "session.json", "slviewer import"):
         Session.open(tmp_path)
     (tmp_path / "notes.txt").write_text("mine")
     with pytest.raises(SessionError):
@@ -321,10 +324,10 @@ def test_sessions_from_elsewhere(tmp_path):
     about = folder / "session.json"
     good = json.loads(about.read_text())
     about.write_text(json.dumps({**good, "schema": 3}))
-    with pytest.raises(SessionError, match=r"3.*2"):
+    with raises(SessionError, folder, "schema 3", 2):
         Session.open(folder)
     about.write_text(json.dumps({**good, "schema": "one"}))
-    with pytest.raises(SessionError, match="schema"):
+    with raises(SessionError, about, "schema"):
         Session.open(folder, write=True)
     about.write_bytes(b'{"schema": 1, "cre')
     with pytest.raises(SessionError):

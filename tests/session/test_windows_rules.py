@@ -5,15 +5,17 @@ import io
 import os
 import subprocess
 import sys
-import threading
+import time
 from pathlib import Path
 
 import pytest
+from facts import raises
 
 from slviewer import terminal
 from slviewer.errors import InputError, SessionError
 from slviewer.session.atomic import replace_file
 from slviewer.session.capture import NewCapture
+from slviewer.session.layout import new_folder
 from slviewer.session.names import new_name, safe_name
 from slviewer.session.store import Session
 
@@ -78,18 +80,15 @@ def test_a_session_is_saved_and_replaced_by_the_rules_of_windows(windows, tmp_pa
 
 
 def test_a_file_that_another_program_has_open_for_a_moment_is_waited_for(windows, monkeypatch, tmp_path) -> None:
-    monkeypatch.setattr("slviewer.session.atomic._PATIENCE_S", 5.0)
     path = tmp_path / "table.csv"
     replace_file(path, b"old")
-    held = open(path, "rb")  # noqa: SIM115 - closed by the timer
-    timer = threading.Timer(0.3, held.close)
-    timer.start()
-    replace_file(path, b"new")
-    assert path.read_bytes() == b"new"
-    timer.join()
-    monkeypatch.setattr("slviewer.session.atomic._PATIENCE_S", 0.1)
-    with open(path, "rb"), pytest.raises(SessionError):
-        replace_file(path, b"never")
+    with open(path, "rb") as held:
+        pauses = []
+        monkeypatch.setattr(time, "sleep", lambda seconds: pauses.append(seconds) or len(pauses) < 3 or held.close())
+        replace_file(path, b"new", patience_s=60.0)
+    assert path.read_bytes() == b"new" and len(pauses) == 3
+    with open(path, "rb"), raises(SessionError, "table.csv"):
+        replace_file(path, b"never", patience_s=0.0)
     assert path.read_bytes() == b"new" and [each.name for each in tmp_path.iterdir()] == ["table.csv"]
 
 
@@ -100,7 +99,7 @@ def test_names_of_devices_are_refused_for_what_is_new(session, sequence, frames,
         lambda: session.save_capture(name, "scan", sequence, frames, source="test"),
         lambda: session.save_rig(name, ""),
     ):
-        with pytest.raises(InputError, match=name):
+        with raises(InputError, f"'{name}'", "device"):
             save()
     assert safe_name(name) == name  # what an older version saved can be read
     assert new_name("console") == "console" and new_name("com10") == "com10"
@@ -109,28 +108,28 @@ def test_names_of_devices_are_refused_for_what_is_new(session, sequence, frames,
 def test_names_that_differ_in_case_alone_are_refused(session, sequence, frames) -> None:
     session.save_capture("Part", "scan", sequence, frames, source="test")
     session.save_rig("bench", "settle_ms = 1")
-    for save in (
-        lambda: session.save_capture("part", "scan", sequence, frames, source="test"),
-        lambda: session.save_capture("PART", "scan", sequence, frames, source="test", force=True),
-        lambda: session.save_rig("Bench", ""),
-        lambda: session.save_captures([NewCapture(n, sequence, frames, None, "test", {}) for n in ("a", "A")], "scan"),
+    both = [NewCapture(name, sequence, frames, None, "test", {}) for name in ("a", "A")]
+    for save, *names in (
+        (lambda: session.save_capture("part", "scan", sequence, frames, source="test"), "'part'", "'Part'"),
+        (lambda: session.save_capture("PART", "scan", sequence, frames, source="", force=True), "'PART'", "'Part'"),
+        (lambda: session.save_rig("Bench", ""), "'Bench'", "'bench'"),
+        (lambda: session.save_captures(both, "scan"), "'a'", "'A'"),
     ):
-        with pytest.raises(InputError, match=r"alike|tell them apart"):
+        with raises(InputError, *names, "Windows"):
             save()
     assert session.capture_names() == ["Part"]
     session.save_capture("Part", "scan", sequence, frames, source="test", force=True)
 
 
-def test_a_session_s_path_leaves_room_for_its_files(monkeypatch, tmp_path) -> None:
+def test_a_session_s_path_leaves_room_for_its_files(tmp_path) -> None:
     long = tmp_path / ("x" * 120)
-    monkeypatch.setattr("slviewer.session.layout._IS_WINDOWS", True)
-    with pytest.raises(SessionError, match="259"):
-        Session.create(long)
+    with raises(SessionError, len(str(long)), 259, 120):
+        new_folder(long, is_windows=True)
     assert not long.exists()
-    monkeypatch.setattr("slviewer.session.layout._IS_WINDOWS", False)
     Session.create(long).close()
 
 
+@pytest.mark.process
 def test_files_are_opened_with_an_encoding() -> None:
     """By default Windows reads and writes text in a code page of its own."""
     command = [sys.executable, "-m", "ruff", "check", "--preview", "--select", "PLW1514", "slviewer", "docs"]

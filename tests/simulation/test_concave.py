@@ -15,6 +15,8 @@ from slviewer.simulation.plans import rotation
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import letter
 
+pytestmark = pytest.mark.computes
+
 RIG = letter(0.3)
 POSE = Pose(rotation(np.radians([0, 15, 0])), np.array([0, 0, 640.0]))
 
@@ -83,6 +85,7 @@ def test_micro_phase_shifting_measures_a_groove_that_misleads_gray_code():
     assert np.mean(np.abs(fine) > 5 * sigma) < 0.03
 
 
+@pytest.mark.slow
 def test_without_bounces_both_measure_to_the_noise():
     for sequence_of in (p18, micro):
         errors, sigma = coordinate_errors(sequence_of, bounces=0)

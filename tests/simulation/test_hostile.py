@@ -14,6 +14,8 @@ from slviewer.simulation.hostile_scenes import MirrorTable, put_on_table, with_h
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import letter
 
+pytestmark = pytest.mark.computes
+
 PROJECTOR = (912, 1140)
 SEQUENCE = PatternSequence(
     PROJECTOR,
@@ -137,7 +139,9 @@ def test_the_mirror_shows_the_plane_below_itself_and_lights_it_again():
     assert (light / exposures - alone)[:, table.is_direct(rays)].max() > 5
 
 
-@pytest.mark.parametrize("name", FAULTS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[] if k % 3 == 0 else pytest.mark.slow) for k, name in enumerate(FAULTS)]
+)
 def test_every_fault_disturbs_the_capture_more_the_more_severe_it_is(name):
     fault, number = FAULTS[name], 3
     clean = expose_frames(RIG, LIGHT, SEQUENCE, RENDERER.room_light(), number).astype(float)

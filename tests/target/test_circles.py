@@ -5,7 +5,9 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from facts import raises
 from rendered_board import View
+from variants import crossed, often
 
 from slviewer.errors import DetectionError, InputError
 from slviewer.target.board import Board
@@ -35,7 +37,7 @@ def rms(difference: np.ndarray) -> float:
     return float(np.sqrt((difference**2).sum(1).mean()))
 
 
-@pytest.mark.parametrize("tilt", [0, 20, 35])
+@pytest.mark.parametrize("tilt", [*often(0, 20), 35])
 def test_centroids_are_exact_to_a_hundredth_of_a_pixel_under_uneven_light(tilt: float) -> None:
     view = View(size=(480, 360), tilt=tilt, axis=70, shade=4)
     found = detect(BOARD, view.render(BOARD)).pixels
@@ -49,18 +51,20 @@ def test_centroids_are_exact_to_a_hundredth_of_a_pixel_under_uneven_light(tilt: 
     ("notation", "view", "limit"),
     [
         ("circles:9x7:20", replace(SMALL, noise=3, shade=3, tilt=20), 0.04),
-        ("circles:9x7:20", replace(SMALL, blur=2.5, tilt=20), 0.03),
-        ("circles:9x7:20", replace(SMALL, tilt=45, axis=40, shade=2), 0.03),
         ("circles:9x7:20", replace(SMALL, inverted=True, shade=3, noise=1, tilt=25), 0.04),
-        ("circles:9x7:20", replace(SMALL, shade=10), 0.03),
-        ("circles:9x7:20", replace(SMALL, fill=0.3, noise=1), 0.06),
-        ("circles:9x7:20", replace(SMALL, diameter=0.75, tilt=15), 0.02),
-        ("circles:9x7:20", replace(SMALL, diameter=0.25, tilt=15), 0.02),
-        ("circles:3x3:20", replace(SMALL, diameter=0.7, tilt=15, fill=0.6), 0.02),
         ("circles:9x7:20", replace(SMALL, k1=0.4, tilt=20), 0.15),  # distortion moves centroids as well
-        ("circles:21x16:9", replace(SMALL, fill=0.85, tilt=15), 0.03),
         ("acircles:4x11:20", replace(SMALL, tilt=25, shade=3, noise=1), 0.03),
-        ("acircles:7x6:20", replace(SMALL, tilt=40, axis=20, shade=3, noise=1), 0.03),
+        *often(
+            ("circles:9x7:20", replace(SMALL, blur=2.5, tilt=20), 0.03),
+            ("circles:9x7:20", replace(SMALL, tilt=45, axis=40, shade=2), 0.03),
+            ("circles:9x7:20", replace(SMALL, shade=10), 0.03),
+            ("circles:9x7:20", replace(SMALL, fill=0.3, noise=1), 0.06),
+            ("circles:9x7:20", replace(SMALL, diameter=0.75, tilt=15), 0.02),
+            ("circles:9x7:20", replace(SMALL, diameter=0.25, tilt=15), 0.02),
+            ("circles:3x3:20", replace(SMALL, diameter=0.7, tilt=15, fill=0.6), 0.02),
+            ("circles:21x16:9", replace(SMALL, fill=0.85, tilt=15), 0.03),
+            ("acircles:7x6:20", replace(SMALL, tilt=40, axis=20, shade=3, noise=1), 0.03),
+        ),
     ],
 )
 def test_found_whatever_the_view(notation: str, view: View, limit: float) -> None:
@@ -94,12 +98,14 @@ def test_other_image_types_give_the_same() -> None:
 
 @pytest.mark.parametrize("image", [np.zeros((300, 400)), np.zeros((300, 400, 4), np.uint8), np.zeros((4, 4), np.uint8)])
 def test_what_is_no_image_is_refused(image: np.ndarray) -> None:
-    with pytest.raises(InputError, match="uint8 or uint16"):
+    with raises(InputError, "uint8", "uint16"):
         detect(BOARD, image)
 
 
-@pytest.mark.parametrize("notation", ["circles:9x7:20", "acircles:5x8:20", "circles:6x6:20"])
-@pytest.mark.parametrize("roll", [0, 50, 100, 180, 250, 330])
+@pytest.mark.parametrize(
+    ("notation", "roll"),
+    crossed(["circles:9x7:20", "acircles:5x8:20", "circles:6x6:20"], [180, 100, 50, 0, 250, 330]),
+)
 def test_a_symmetric_board_starts_where_the_rule_says(notation: str, roll: float) -> None:
     board, view = Board.parse(notation), replace(SMALL, roll=roll, tilt=20, fill=0.65)
     pixels = detect(board, view.render(board)).pixels
@@ -114,8 +120,10 @@ def test_a_symmetric_board_starts_where_the_rule_says(notation: str, roll: float
     assert sorted(apart.argmin(1)) == list(range(len(pixels))) and apart.min(1).max() < 0.5
 
 
-@pytest.mark.parametrize("notation", ["circles:9x7:20", "acircles:5x8:20", "circles:6x6:20", "acircles:4x9:20"])
-@pytest.mark.parametrize("roll", [0, 70, 130, 180, 250, 330])
+@pytest.mark.parametrize(
+    ("notation", "roll"),
+    crossed(["circles:9x7:20", "acircles:5x8:20", "circles:6x6:20", "acircles:4x9:20"], [180, 70, 250, 130, 0, 330]),
+)
 def test_a_marked_board_starts_at_its_mark(notation: str, roll: float) -> None:
     board, view = Board.parse(notation), replace(SMALL, roll=roll, tilt=20, fill=0.6, shade=2, noise=1, marked=True)
     detection = detect(board, view.render(board))
@@ -130,13 +138,15 @@ def test_a_marked_board_starts_at_its_mark(notation: str, roll: float) -> None:
 @pytest.mark.parametrize(
     "view",
     [
-        replace(SMALL, blur=2.0, roll=180, fill=0.6),
         replace(SMALL, inverted=True, roll=180, fill=0.6, noise=2),
         replace(SMALL, roll=180, tilt=45, axis=40, shade=6, fill=0.6),
-        replace(SMALL, roll=170, fill=0.35, noise=1),
-        replace(SMALL, roll=190, k1=0.4, tilt=20, fill=0.8),
-        replace(SMALL, roll=180, diameter=0.3, noise=3, fill=0.6),
-        replace(SMALL, roll=180, diameter=0.7, noise=3, fill=0.6),
+        *often(
+            replace(SMALL, blur=2.0, roll=180, fill=0.6),
+            replace(SMALL, roll=170, fill=0.35, noise=1),
+            replace(SMALL, roll=190, k1=0.4, tilt=20, fill=0.8),
+            replace(SMALL, roll=180, diameter=0.3, noise=3, fill=0.6),
+            replace(SMALL, roll=180, diameter=0.7, noise=3, fill=0.6),
+        ),
     ],
 )
 def test_the_mark_is_seen_whatever_the_view(view: View) -> None:
@@ -154,7 +164,7 @@ def test_dirt_like_a_mark_at_both_ends_tells_nothing() -> None:
     assert rms(detection.pixels - view.truth(BOARD)) < 0.1
 
 
-@pytest.mark.parametrize("roll", [0, 90, 145, 180, 270])
+@pytest.mark.parametrize("roll", [145, 180, *often(0, 90, 270)])
 def test_an_odd_asymmetric_board_is_numbered_by_its_own_pattern(roll: float) -> None:
     board, view = Board.parse("acircles:4x9:20"), replace(SMALL, roll=roll, tilt=20, fill=0.65)
     assert rms(detect(board, view.render(board)).pixels - view.truth(board)) < 0.15
@@ -164,24 +174,23 @@ def test_an_odd_asymmetric_board_is_numbered_by_its_own_pattern(roll: float) -> 
     ("notation", "hide"),
     [
         ("circles:9x7:20", (-30, -30, 190, 10)),  # the first row
-        ("circles:9x7:20", (150, -30, 190, 190)),  # the last column
         ("circles:9x7:20", (70, 50, 90, 70)),  # one circle in the middle
         ("acircles:4x11:20", (-30, -30, 190, 10)),
-        ("acircles:4x11:20", (-30, -30, 190, 30)),
+        *often(("circles:9x7:20", (150, -30, 190, 190)), ("acircles:4x11:20", (-30, -30, 190, 30))),  # the last column
     ],
 )
 def test_hidden_circles_are_counted_not_guessed(notation: str, hide: tuple[float, float, float, float]) -> None:
     board = Board.parse(notation)
     x, y = board.points[:, :2].T
     left = np.count_nonzero(~((x > hide[0]) & (y > hide[1]) & (x < hide[2]) & (y < hide[3])))
-    with pytest.raises(DetectionError, match=f"^{left} of {len(x)} "):
+    with raises(DetectionError, f"{left} of {len(x)}"):
         detect(board, replace(SMALL, hide=hide, tilt=10).render(board))
 
 
 @pytest.mark.parametrize("notation", ["circles:9x7:20", "acircles:4x11:20"])
 def test_partly_covered_circles_are_refused(notation: str) -> None:
-    with pytest.raises(DetectionError, match=r"\d+ of \d+"):
-        board = Board.parse(notation)
+    board = Board.parse(notation)
+    with raises(DetectionError, f"of {len(board.points)}"):
         detect(board, replace(SMALL, hide=(-30, -30, 190, -1.5), tilt=10).render(board))
 
 
@@ -190,23 +199,23 @@ def test_a_stain_on_one_circle_is_refused() -> None:
     image = view.render(BOARD)
     u, v = np.round(view.truth(BOARD)[30]).astype(int).tolist()
     cv2.circle(image, (u + 9, v), 3, 40, -1, cv2.LINE_AA)
-    with pytest.raises(DetectionError, match="1 of 63"):
+    with raises(DetectionError, "1 of 63"):
         detect(BOARD, image)
 
 
 def test_a_board_partly_out_of_view_is_refused() -> None:
-    with pytest.raises(DetectionError, match="of 63"):
+    with raises(DetectionError, "of 63"):
         detect(BOARD, replace(SMALL, shift=(70, 0)).render(BOARD))
 
 
-@pytest.mark.parametrize("wrong", ["circles:8x7:20", "circles:9x6:20", "circles:7x7:20"])
+@pytest.mark.parametrize("wrong", ["circles:8x7:20", *often("circles:9x6:20", "circles:7x7:20")])
 def test_a_larger_grid_than_stated_is_refused(wrong: str) -> None:
-    with pytest.raises(DetectionError, match=r"63 .*columns"):
+    with raises(DetectionError, "63 circles", "columns"):
         detect(Board.parse(wrong), replace(SMALL, tilt=15).render(BOARD))
 
 
 def test_a_smaller_grid_than_stated_is_refused() -> None:
-    with pytest.raises(DetectionError, match="63 of 70"):
+    with raises(DetectionError, "63 of 70"):
         detect(Board.parse("circles:10x7:20"), replace(SMALL, tilt=15).render(BOARD))
 
 
@@ -218,23 +227,24 @@ def test_a_transposed_notation_is_the_same_board_turned() -> None:
 
 def test_squares_are_not_taken_for_circles() -> None:
     chessboard = Board.parse("chessboard:9x7:20")
-    with pytest.raises(DetectionError, match="squares"):
+    with raises(DetectionError, "squares"):
         detect(Board.parse("acircles:5x8:20"), replace(SMALL, blur=0.5, fill=0.5).render(chessboard))
 
 
 def test_overexposure_is_named() -> None:
-    with pytest.raises(DetectionError, match=r"exposure.*\d+%"):
-        detect(BOARD, replace(SMALL, paper=3000).render(BOARD))
+    image = replace(SMALL, paper=3000).render(BOARD)
+    with raises(DetectionError, "exposure", f"{np.mean(image[::4, ::4] == 255):.0%}", "saturated"):
+        detect(BOARD, image)
 
 
 def test_an_empty_image_is_refused() -> None:
     for level in (0, 128):
-        with pytest.raises(DetectionError, match="circles"):
+        with raises(DetectionError, "circles", 63):
             detect(BOARD, np.full((300, 400), level, np.uint8))
 
 
 def test_noise_is_refused() -> None:
-    with pytest.raises(DetectionError, match="circles"):
+    with raises(DetectionError, "circles", 63):
         detect(BOARD, np.random.default_rng(0).integers(0, 255, (300, 400), np.uint8))
 
 

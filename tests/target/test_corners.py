@@ -4,7 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from facts import raises
 from rendered_board import View
+from variants import crossed, often
 
 from slviewer.errors import DetectionError
 from slviewer.target.board import Board
@@ -25,13 +27,15 @@ def rms(difference: np.ndarray) -> float:
     ("notation", "view", "limit"),
     [
         ("chessboard:9x7:20", View(size=(480, 360), shade=4), 0.006),
-        ("chessboard:9x7:20", View(size=(480, 360), shade=4, tilt=20, axis=70), 0.02),
-        ("chessboard:9x7:20", View(size=(480, 360), shade=4, tilt=45, axis=70, noise=2), 0.03),
         ("chessboard:9x7:20", replace(SMALL, blur=2, noise=2, tilt=20), 0.05),
-        ("chessboard:9x7:20", replace(SMALL, shade=10, tilt=20), 0.04),
-        ("chessboard:9x7:20", replace(SMALL, k1=0.4, tilt=20), 0.05),
-        ("charuco:8x6:20", View(size=(480, 360), fill=0.6, shade=4, tilt=20, axis=70, noise=1), 0.02),
         ("charuco:7x5:20:12:DICT_4X4_50", replace(SMALL, fill=0.55, tilt=40, axis=20), 0.04),
+        *often(
+            ("chessboard:9x7:20", View(size=(480, 360), shade=4, tilt=20, axis=70), 0.02),
+            ("chessboard:9x7:20", View(size=(480, 360), shade=4, tilt=45, axis=70, noise=2), 0.03),
+            ("chessboard:9x7:20", replace(SMALL, shade=10, tilt=20), 0.04),
+            ("chessboard:9x7:20", replace(SMALL, k1=0.4, tilt=20), 0.05),
+            ("charuco:8x6:20", View(size=(480, 360), fill=0.6, shade=4, tilt=20, axis=70, noise=1), 0.02),
+        ),
     ],
 )
 def test_corners_are_exact_to_hundredths_of_a_pixel(notation: str, view: View, limit: float) -> None:
@@ -41,15 +45,17 @@ def test_corners_are_exact_to_hundredths_of_a_pixel(notation: str, view: View, l
     assert 1e-5 < rms(detection.pixels - view.truth(board)) < limit
 
 
-@pytest.mark.parametrize("notation", ["chessboard:8x7:20", "chessboard:7x8:20", "charuco:7x5:20", "charuco:6x6:20"])
-@pytest.mark.parametrize("roll", [0, 90, 150, 180, 270])
+@pytest.mark.parametrize(
+    ("notation", "roll"),
+    crossed(["chessboard:8x7:20", "chessboard:7x8:20", "charuco:7x5:20", "charuco:6x6:20"], [180, 90, 150, 270, 0]),
+)
 def test_a_board_with_marks_of_its_own_keeps_its_numbers(notation: str, roll: float) -> None:
     board, view = Board.parse(notation), replace(SMALL, roll=roll, tilt=20, fill=0.7)
     detection = detect(board, view.render(board))
     assert rms(detection.pixels - view.truth(board)[detection.ids]) < 0.1
 
 
-@pytest.mark.parametrize("roll", [0, 60, 180, 300])
+@pytest.mark.parametrize("roll", [60, 180, *often(0, 300)])
 def test_a_symmetric_chessboard_is_numbered_from_the_left(roll: float) -> None:
     view = replace(SMALL, roll=roll, tilt=20, fill=0.65)
     pixels = detect(CHESSBOARD, view.render(CHESSBOARD)).pixels
@@ -58,7 +64,7 @@ def test_a_symmetric_chessboard_is_numbered_from_the_left(roll: float) -> None:
 
 
 def test_hidden_corners_are_counted_not_guessed() -> None:
-    with pytest.raises(DetectionError, match=r"of 63 .*chessboard:9x7:20"):
+    with raises(DetectionError, "of 63", "chessboard:9x7:20"):
         detect(CHESSBOARD, replace(SMALL, hide=(-30, -30, 190, 10)).render(CHESSBOARD))
 
 
@@ -67,21 +73,25 @@ def test_a_stain_on_one_corner_is_refused() -> None:
     image = view.render(CHESSBOARD)
     u, v = np.round(view.truth(CHESSBOARD)[30]).astype(int).tolist()
     image[v - 2 : v + 6, u - 2 : u + 6] = 60
-    with pytest.raises(DetectionError, match=r"\b1 of 63\b"):
+    with raises(DetectionError, "1 of 63"):
         detect(CHESSBOARD, image)
 
 
 def test_a_board_partly_out_of_view_is_refused() -> None:
-    with pytest.raises(DetectionError, match="of 63"):
+    with raises(DetectionError, "of 63"):
         detect(CHESSBOARD, replace(SMALL, shift=(90, 0)).render(CHESSBOARD))
 
 
 @pytest.mark.parametrize(
     ("wrong", "tilt"),
-    [("chessboard:8x7:20", 25), ("chessboard:9x6:20", 0), ("chessboard:7x5:20", 25), ("chessboard:6x7:20", 25)],
+    [
+        ("chessboard:8x7:20", 25),
+        ("chessboard:9x6:20", 0),
+        *often(("chessboard:7x5:20", 25), ("chessboard:6x7:20", 25)),
+    ],
 )
 def test_a_larger_chessboard_than_stated_is_refused(wrong: str, tilt: float) -> None:
-    with pytest.raises(DetectionError, match="columns"):
+    with raises(DetectionError, wrong, "columns"):
         detect(Board.parse(wrong), replace(SMALL, tilt=tilt).render(CHESSBOARD))
 
 
@@ -97,13 +107,13 @@ def test_a_hidden_part_of_a_charuco_board_leaves_the_rest() -> None:
 
 def test_too_few_charuco_corners_are_refused() -> None:
     board = Board.parse("charuco:7x5:20")
-    with pytest.raises(DetectionError, match=r"of 24 .*of 17 .*8"):
+    with raises(DetectionError, "of 24", "of 17", 8):
         detect(board, replace(SMALL, hide=(-30, -30, 90, 90)).render(board))
 
 
 def test_another_dictionary_is_not_found() -> None:
     image = SMALL.render(Board.parse("charuco:7x5:20:15:DICT_4X4_50"))
-    with pytest.raises(DetectionError, match="0 of 24"):
+    with raises(DetectionError, "0 of 24"):
         detect(Board.parse("charuco:7x5:20"), image)
 
 
@@ -113,13 +123,13 @@ def test_a_grid_with_a_misplaced_or_mirrored_feature_is_refused() -> None:
     check_grid(CHESSBOARD, truth, ids, "corners")
     off = truth.copy()
     off[20] += (5.0, 0.0)
-    with pytest.raises(DetectionError, match="grid"):
+    with raises(DetectionError, "grid"):
         check_grid(CHESSBOARD, off, ids, "corners")
     swapped = truth.copy()
     swapped[[20, 21]] = swapped[[21, 20]]
     with pytest.raises(DetectionError):
         check_grid(CHESSBOARD, swapped, ids, "corners")
-    with pytest.raises(DetectionError, match="mirrored"):
+    with raises(DetectionError, "mirrored"):
         check_grid(CHESSBOARD, truth * (-1, 1), ids, "corners")
-    with pytest.raises(DetectionError, match="line"):
+    with raises(DetectionError, "8", "line"):
         check_grid(CHESSBOARD, truth[:8], ids[:8], "corners")

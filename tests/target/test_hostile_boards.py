@@ -5,8 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from facts import raises
 from hostile_board import Disc, Scene, blobs_around, lattice_around
 from rendered_board import View
+from variants import often
 
 from slviewer.errors import DetectionError
 from slviewer.target.board import Board
@@ -54,7 +56,7 @@ def distance(pixels: np.ndarray, truth: np.ndarray, half_turn: bool) -> np.ndarr
     return turned if half_turn and turned.max() < straight.max() else straight
 
 
-@pytest.mark.parametrize("board", [SYMMETRIC, ASYMMETRIC], ids=str)
+@pytest.mark.parametrize("board", [SYMMETRIC, *often(ASYMMETRIC)], ids=str)
 def test_a_board_among_clutter_is_detected_in_order(board: Board) -> None:
     detected, errors = 0, []
     scenes = [scene for scene in hostile_scenes(board, 1)]
@@ -82,11 +84,13 @@ def corners_of(board: Board, away: float, radius: float) -> tuple[Disc, ...]:
     "clutter",
     [
         corners_of(SYMMETRIC, 0.8, 0.2)[:1],  # a screw
-        corners_of(SYMMETRIC, 0.6, 0.25)[3:],
-        corners_of(SYMMETRIC, 0.62, 0.04)[:1],  # a speck of dirt
         ((-0.8, -0.5, 0.13, 0.08),),  # a dot of the mark's size beside its place
-        ((9.0, 6.9, 0.5, 0.08),),
-        tuple((x, -0.65, 0.12, 0.08) for x in np.linspace(-0.9, 3.0, 14)),  # a line of print
+        *often(
+            (corners_of(SYMMETRIC, 0.6, 0.25)[3:],),
+            (corners_of(SYMMETRIC, 0.62, 0.04)[:1],),  # a speck of dirt
+            (((9.0, 6.9, 0.5, 0.08),),),
+            (tuple((x, -0.65, 0.12, 0.08) for x in np.linspace(-0.9, 3.0, 14)),),  # a line of print
+        ),
     ],
 )
 def test_what_lies_beside_a_board_is_no_mark(clutter: tuple[Disc, ...]) -> None:
@@ -97,6 +101,7 @@ def test_what_lies_beside_a_board_is_no_mark(clutter: tuple[Disc, ...]) -> None:
     np.testing.assert_allclose(cluttered.pixels, plain.pixels, atol=0.2)
 
 
+@pytest.mark.slow
 def test_warm_spots_beyond_the_edge_of_a_thermal_board_are_no_mark() -> None:
     rng, detected = np.random.default_rng(4), 0
     for k in range(12):
@@ -114,7 +119,7 @@ def test_warm_spots_beyond_the_edge_of_a_thermal_board_are_no_mark() -> None:
     assert detected >= 4
 
 
-@pytest.mark.parametrize("roll", [0.0, 180.0])
+@pytest.mark.parametrize("roll", [*often(0.0), 180.0])
 def test_a_marked_board_among_clutter_starts_at_its_mark(roll: float) -> None:
     for seed in range(2):
         around = blobs_around(SYMMETRIC, seed, 60, sheet=1.2)
@@ -127,7 +132,7 @@ def test_a_marked_board_among_clutter_starts_at_its_mark(roll: float) -> None:
 def test_one_more_row_that_belongs_to_the_grid_is_refused() -> None:
     for share in (0.5, 1.0):
         scene = replace(SCENE, sheet=1.3, tilt=15, discs=lattice_around(SYMMETRIC, 0, share))
-        with pytest.raises(DetectionError, match=r"circles:9x7:20.*63"):
+        with raises(DetectionError, "circles:9x7:20", 63):
             detect(SYMMETRIC, scene.render(SYMMETRIC))
 
 
@@ -137,7 +142,7 @@ def test_of_two_boards_the_much_larger_is_taken_and_of_two_alike_none() -> None:
     detection = detect(SYMMETRIC, scene.render(SYMMETRIC))
     assert np.linalg.norm(detection.pixels - scene.truth(SYMMETRIC), axis=1).max() < 0.2
     mirrored = replace(scene, fill=0.4, shift=(-100.0, 0.0), second=replace(small, fill=0.38, shift=(90.0, 0.0)))
-    with pytest.raises(DetectionError, match=r"2 .*circles:9x7:20"):
+    with raises(DetectionError, "2 boards", "circles:9x7:20"):
         detect(SYMMETRIC, mirrored.render(SYMMETRIC))
 
 
@@ -146,11 +151,11 @@ def test_a_covered_circle_among_clutter_is_counted_not_replaced() -> None:
     for hidden in (0, 31):
         x, y = SYMMETRIC.points[hidden, :2]
         scene = replace(SCENE, tilt=15, discs=blobs, hide=(x - 8, y - 8, x + 8, y + 8))
-        with pytest.raises(DetectionError, match=r"62 of 63.*circles:9x7:20"):
+        with raises(DetectionError, "62 of 63", "circles:9x7:20"):
             detect(SYMMETRIC, scene.render(SYMMETRIC))
 
 
-@pytest.mark.parametrize("shift", [80, 110, 140])
+@pytest.mark.parametrize("shift", [110, *often(80, 140)])
 def test_a_board_that_reaches_beyond_the_image_says_at_which_side(shift: int) -> None:
-    with pytest.raises(DetectionError, match=r"of 63 .*right"):
+    with raises(DetectionError, "of 63", "right"):
         detect(SYMMETRIC, replace(SCENE, shift=(shift, 0)).render(SYMMETRIC))
