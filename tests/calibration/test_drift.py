@@ -31,7 +31,7 @@ def later() -> list[Pose]:
 
 @pytest.fixture(scope="module")
 def reference():
-    observations = [seen(RIG, pose, f"pose_{i}") for i, pose in enumerate(poses(RIG, 20, seed=3))]
+    observations = [seen(RIG, pose, f"pose_{i}") for i, pose in enumerate(poses(RIG, 12, seed=3))]
     model = calibrate_stereo(observations, RIG.projector.size, str(BOARD))
     found = build_reference(model.rig, [DriftView.from_observation(o) for o in observations if o.name in model.poses])
     kept = DriftReference.from_arrays(model.rig, found.to_arrays())  # as a session keeps it

@@ -137,10 +137,11 @@ def test_decisions_heed_the_tests_own_uncertainty(true_test, limit, decision):
 
 
 @pytest.mark.computes
-def test_planes_are_flat_to_their_noise():
+@pytest.mark.parametrize("count", [2, pytest.param(6, marks=pytest.mark.slow)])
+def test_planes_are_flat_to_their_noise(count):
     artefact = Artefact.from_dict(tomllib.loads((EXAMPLES / "plane.toml").read_text()))
     found = []
-    for i, place in enumerate(plane_places(RIG, R2)):
+    for i, place in enumerate(plane_places(RIG, R2)[:count]):
         T = place.T_camera_artefact
         plate = blank_board(Pose(T[:3, :3], T[:3, 3]), (140.0, 110.0))
         cloud = reconstruct(true_model(), phases_of(plate, 50 + i))
@@ -150,7 +151,7 @@ def test_planes_are_flat_to_their_noise():
         assert position.rms_mm[0] == pytest.approx(position.floor_mm[0], rel=0.08)
         width = position.error(FLATNESS).within_95_mm[1]
         assert width == pytest.approx(2 * 1.96 * position.rms_mm[0], rel=0.2)
-    assert test.scale is None and test.decision == "pass" and test.lacks == ()
+    assert test.scale is None and test.decision == "pass" and (test.lacks == ()) == (count == 6)
 
 
 @pytest.mark.computes
