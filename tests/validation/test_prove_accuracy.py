@@ -42,6 +42,7 @@ def proof() -> Proof:
 
 
 @pytest.mark.computes
+@pytest.mark.slow
 def test_a_rig_is_measured_from_its_images(proof: Proof) -> None:
     (rig,) = proof.record["rigs"]
     (plane,) = rig.planes.values()
