@@ -57,13 +57,23 @@ def plane_rms_mm(found: DiagnosedCalibration, poses: list[Observation]) -> float
     return float(np.mean(rms))
 
 
+@pytest.mark.computes
 def test_a_sound_calibration_is_good() -> None:
     found = attempt(observations(8))
     assert found.verdict == Verdict() and found.verdict.level == "good" and found.verdict.reason == ""
     assert len(found.observations) == 8 and not found.excluded
 
 
-@pytest.mark.parametrize("order", ["transposed", "row", "mirrored", "noise", "bent", "moved"])
+@pytest.mark.computes
+@pytest.mark.parametrize(
+    "order",
+    [
+        "transposed",
+        "noise",
+        "moved",
+        *(pytest.param(each, marks=pytest.mark.slow) for each in ("row", "mirrored", "bent")),
+    ],
+)
 def test_one_bad_pose_of_twenty_is_named_and_changes_nothing(order: str) -> None:
     clean = observations()
     base = attempt(clean)
@@ -97,6 +107,7 @@ def test_one_bad_pose_of_twenty_is_named_and_changes_nothing(order: str) -> None
     assert plane_rms_mm(found, clean) == pytest.approx(plane_rms_mm(base, clean), rel=0.02)
 
 
+@pytest.mark.computes
 def test_what_cannot_be_used_is_kept_to_look_into_if_it_is_a_rig_at_all() -> None:
     bent = observations(6)
     for k, o in enumerate(bent):

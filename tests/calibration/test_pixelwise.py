@@ -12,6 +12,8 @@ from slviewer.calibration.stereo import calibrate_stereo
 from slviewer.errors import CalibrationRejected
 from slviewer.fringe.phase import PhaseMap
 
+pytestmark = pytest.mark.computes
+
 TRUE = rig()
 OBSERVATIONS = [observation(TRUE, T, f"pose_{k:02d}", 0.01) for k, T in enumerate(board_poses(16))]
 

@@ -12,6 +12,8 @@ from slviewer.calibration.soundness import MIN_POSES
 from slviewer.calibration.stereo import StereoModel, calibrate_stereo
 from slviewer.errors import CalibrationRejected
 
+pytestmark = pytest.mark.computes
+
 TRUE = rig()
 
 
