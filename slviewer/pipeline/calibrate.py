@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, Literal, TypeVar
 
 import numpy as np
@@ -128,6 +129,7 @@ def calibrate(
     exclude: Sequence[str] = (),
     smoothing: SmoothingKind = "spline",
     degree: int = 5,
+    cells_across: int | None = None,
     progress: Progress = ignore_progress,
     warn: Warn = ignore_warnings,
 ) -> CalibrationResult:
@@ -144,6 +146,8 @@ def calibrate(
         exclude: Exclude these target poses, this time; the wizard excludes poses for good.
         smoothing: How the Letter's step 2 smooths a board's phase; the spline preserves the local distortion.
         degree: Degree of the polynomial, with --smoothing polynomial.
+
+    ``cells_across``: cells of each of the splined model's displacement fields across its image, by default 26.
 
     A pose that cannot be used is excluded with the reason. The verdict is saved beside the models. Raises
     CalibrationRejected with its reason: then stereo alone is stored to be inspected, and used only where the operator
@@ -174,10 +178,13 @@ def calibrate(
             raise rejection_error(diagnosed.verdict, is_saved=False)
         stereo = diagnosed.stereo
         settings = {"target": str(board), "smoothing": smoothing, "degree": degree, "models": list(models)}
+        if cells_across is not None:
+            settings["cells_across"] = cells_across
         if diagnosed.verdict.level == "rejected":
             save_rejected(store, stereo, settings, diagnosed.verdict, names)
             raise rejection_error(diagnosed.verdict, is_saved=True)
-        result = _fit_models(diagnosed, models, part(progress, 0.66, 0.97), warn, excluded_poses)
+        fitting = part(progress, 0.66, 0.97)
+        result = _fit_models(diagnosed, models, fitting, warn, excluded_poses, cells_across)
         if result.verdict.level == "rejected":
             save_rejected(store, stereo, settings, result.verdict, names)
             raise rejection_error(result.verdict, is_saved=True)
@@ -201,6 +208,7 @@ def calibrate_frames(
     models: Sequence[str] = (),
     smoothing: str = "spline",
     degree: int = 5,
+    cells_across: int | None = None,
     progress: Progress = ignore_progress,
     warn: Warn = ignore_warnings,
 ) -> CalibrationResult:
@@ -224,7 +232,8 @@ def calibrate_frames(
     diagnosed = calibrate_poses_with_evidence(read(), len(poses), sequence, board, {}, part(progress, 0, 0.65))
     if diagnosed.stereo is None or diagnosed.verdict.level == "rejected":
         raise rejection_error(diagnosed.verdict, is_saved=False)
-    result = _fit_models(diagnosed, models or DEFAULT_MODELS, part(progress, 0.66, 1.0), warn)
+    fitting = part(progress, 0.66, 1.0)
+    result = _fit_models(diagnosed, models or DEFAULT_MODELS, fitting, warn, cells_across=cells_across)
     if result.verdict.level == "rejected":
         raise rejection_error(result.verdict, is_saved=False)
     return result
@@ -263,6 +272,7 @@ def _fit_models(
     progress: Progress,
     warn: Warn,
     excluded: Container[str] = (),
+    cells_across: int | None = None,
 ) -> CalibrationResult:
     """Fit the models that follow from an accepted stereo calibration; return them with the verdict on all.
 
@@ -278,7 +288,7 @@ def _fit_models(
     for finding in diagnosed.verdict.findings:
         if finding.severity == "doubtful":
             warn(finding.text())
-    result = _fit_after_stereo(models, stereo, diagnosed.observations, progress, warn)
+    result = _fit_after_stereo(models, stereo, diagnosed.observations, progress, warn, cells_across)
     verdict = judge_splined(diagnosed.verdict, result.splined.bundle.noise) if result.splined else diagnosed.verdict
     for finding in verdict.findings:
         if finding not in diagnosed.verdict.findings:
@@ -297,7 +307,12 @@ def _reasons_to_exclude(names: Sequence[str], poses: Sequence[str], exclude: Seq
 
 
 def _fit_after_stereo(
-    models: Sequence[str], stereo: StereoModel, observations: Sequence[Observation], progress: Progress, warn: Warn
+    models: Sequence[str],
+    stereo: StereoModel,
+    observations: Sequence[Observation],
+    progress: Progress,
+    warn: Warn,
+    cells_across: int | None = None,
 ) -> CalibrationResult:
     """Fit the models that follow from stereo; one that cannot be fitted is a warning, and stops no other."""
 
@@ -315,7 +330,8 @@ def _fit_after_stereo(
 
     pixelwise_end = 0.0 if "pixelwise" not in models else 0.33 if "splined" in models else 1.0
     pixelwise = fit("pixelwise", calibrate_pixelwise, 0.0, pixelwise_end, "pixel-wise fit")
-    splined = fit("splined", calibrate_splined, pixelwise_end, 1.0, "joint adjustment")
+    fit_splined = partial(calibrate_splined, cells_across=cells_across)
+    splined = fit("splined", fit_splined, pixelwise_end, 1.0, "joint adjustment")
     for name, why in splined.bundle.excluded.items() if splined else ():
         warn(f"{name} is excluded from the splined model: it {why}")
     return CalibrationResult(stereo, pixelwise, splined)

@@ -346,6 +346,7 @@ def _repeat_calibration(
             poses=poses,
             smoothing=settings["smoothing"],
             degree=settings["degree"],
+            cells_across=settings.get("cells_across"),
         )
 
 

@@ -78,8 +78,16 @@ def time_scaling(progress: Progress = ignore_progress) -> list[Row]:
     return rows
 
 
-def _measure_growth(kind: str, sizes: tuple[float, ...], work: Callable[[float], Callable[[], object]]) -> list[Row]:
-    """Time ``work(size)()`` for each size; the last row's note is what ``_describe_growth`` says of all of them."""
+def _measure_growth(
+    kind: str,
+    sizes: tuple[float, ...],
+    work: Callable[[float], Callable[[], object]],
+    measure_s: Callable[[Callable[[], object], int, bool], float] = median,
+) -> list[Row]:
+    """Time ``work(size)()`` for each size; the last row's note is what ``_describe_growth`` says of all of them.
+
+    ``measure_s``: returns the seconds of a run, from how often it is run and whether it is run once before.
+    """
     seconds, rows = [], []
     for size in sizes:
         run = work(size)
@@ -87,8 +95,8 @@ def _measure_growth(kind: str, sizes: tuple[float, ...], work: Callable[[float],
         run()  # the first time, which also compiles
         memory = tracemalloc.get_traced_memory()[1] / 1e6
         tracemalloc.stop()
-        once = median(run, 1, warm=False)
-        seconds.append(once if once > SLOW_S else median(run, 5, warm=False))
+        once = measure_s(run, 1, False)
+        seconds.append(once if once > SLOW_S else measure_s(run, 5, False))
         rows.append(row(f"{kind}: {size:g}", seconds[-1], memory))
     rows[-1]["note"] = _describe_growth(sizes, seconds)
     return rows
@@ -101,21 +109,21 @@ def _describe_growth(sizes: tuple[float, ...], seconds: list[float]) -> str:
     return f"grows with the power {exponent:.2f}: {verdict}"
 
 
-def _time_pixels(rig: SimulatedRig, scene: Any) -> list[Row]:
+def _time_pixels(rig: SimulatedRig, scene: Any, megapixels: tuple[float, ...] = MEGAPIXELS) -> list[Row]:
     """Rows of decoding 25 frames of several sizes, which are resized from rendered ones."""
     sequence = one_axis(p18(rig.projector.size), "x")
     frames = Renderer(rig, scene).capture(sequence)
 
-    def decode_size(megapixels: float) -> Callable[[], object]:
-        """Return the decoding of frames with so many pixels."""
-        scale = np.sqrt(1e6 * megapixels / frames[0].size)
+    def decode_size(size: float) -> Callable[[], object]:
+        """Return the decoding of frames with so many megapixels."""
+        scale = np.sqrt(1e6 * size / frames[0].size)
         large = np.stack([cv2.resize(frame, None, fx=scale, fy=scale) for frame in frames])
         return lambda: decode(sequence, large, "x")
 
-    return _measure_growth("decode 25 frames, MP", MEGAPIXELS, decode_size)
+    return _measure_growth("decode 25 frames, MP", megapixels, decode_size)
 
 
-def _time_captures(rig: SimulatedRig, scene: Any) -> list[Row]:
+def _time_captures(rig: SimulatedRig, scene: Any, counts: tuple[float, ...] = CAPTURES) -> list[Row]:
     """Rows of the wizard's snapshot of a session with so many captures."""
     with tempfile.TemporaryDirectory(prefix="slviewer-bench-") as folder:
         sequence = PatternSequence(rig.projector.size, one_axis(p18(rig.projector.size), "x").frames)
@@ -131,15 +139,15 @@ def _time_captures(rig: SimulatedRig, scene: Any) -> list[Row]:
                 reader = SessionReader(session, planner)
                 return lambda: reader.read(RigView(), None)
 
-            rows = _measure_growth("snapshot of a session, captures", CAPTURES, read_session)
+            rows = _measure_growth("snapshot of a session, captures", counts, read_session)
             planner.close()
     return rows
 
 
-def _time_scans(rig: SimulatedRig) -> list[Row]:
-    """Rows of registering scans of an object on a turntable, with made-up noise."""
+def _time_scans(rig: SimulatedRig, counts: tuple[int, ...] = SCANS, steps: int = STEPS) -> list[Row]:
+    """Rows of registering scans of an object on a turntable that makes ``steps`` or more, with made-up noise."""
     rng, clouds = np.random.default_rng(0), {}
-    steps = max(STEPS, *SCANS)
+    steps = max(steps, *counts)
     for name, scene in turning(steps).items():
         points = Renderer(rig, scene).truth().points
         noisy = points + rng.normal(0, NOISE_MM, points.shape[:2])[..., None] * np.array([0.0, 0.0, 1.0])
@@ -152,7 +160,7 @@ def _time_scans(rig: SimulatedRig) -> list[Row]:
         angles = {name: 360.0 / steps * k for k, name in enumerate(chosen)}
         return lambda: register_all(chosen, names[0], Starts(table_deg=angles))
 
-    return _measure_growth("register scans of a turn", SCANS, register)
+    return _measure_growth("register scans of a turn", counts, register)
 
 
 def _time_poses(rig: SimulatedRig, plan: dict[str, Any]) -> list[Row]:

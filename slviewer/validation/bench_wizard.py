@@ -8,6 +8,7 @@ import tempfile
 import threading
 import time
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import pairwise
@@ -47,8 +48,10 @@ _FUNCTIONS = 8
 class _Stopwatch:
     """Waiting times, s, by their names, from the snapshots of a wizard at work.
 
-    A listener of the operator's, which is called on one thread only.
+    A listener of the operator's, which is called on one thread only. ``clock``: returns the present time in s.
     """
+
+    clock: Callable[[], float] = time.perf_counter
 
     seconds: dict[str, list[float]] = field(default_factory=lambda: {name: [] for name in LIMITS})
     _last_frame: float | None = None
@@ -57,7 +60,7 @@ class _Stopwatch:
 
     def note(self, snapshot: Snapshot) -> None:
         """Note the time of what differs from the snapshot before."""
-        now, before, self._before = time.perf_counter(), self._before, snapshot
+        now, before, self._before = self.clock(), self._before, snapshot
         if before is None or before.session is None or snapshot.session is None:
             return
         if before.rig.capture is not None and snapshot.rig.capture is None:
@@ -93,10 +96,16 @@ class _Stopwatch:
             self.seconds[f"`slviewer reproduce --quick` {name}"].append(time.perf_counter() - begun)
 
 
-class _Sampler:
-    """Samples, on a thread of its own, which of the package's functions every other thread is in, act by act."""
+def _is_counted(module: str) -> bool:
+    """Whether samples are counted for a module's functions: the package's, but for the wrapper of every kernel."""
+    return module.startswith("slviewer.") and module != "slviewer.geometry.jit"
 
-    def __init__(self) -> None:
+
+class _Sampler:
+    """Samples, on a thread of its own, which of the counted functions every other thread is in, act by act."""
+
+    def __init__(self, is_counted: Callable[[str], bool] = _is_counted) -> None:
+        self._is_counted = is_counted
         self.act = ""
         self.samples: dict[str, Counter[str]] = {}
         self._stopped = threading.Event()
@@ -111,22 +120,17 @@ class _Sampler:
         self._thread.join()
 
     def _run(self) -> None:
-        """Count the innermost function of the package in every thread that is not waiting."""
+        """Count the innermost function that is counted in every thread that is not waiting."""
         while not self._stopped.wait(_SAMPLING_S):
             for thread, frame in sys._current_frames().items():
                 if thread == self._thread.ident or frame.f_code.co_filename.endswith(_WAITING):
                     continue
                 inner: Any = frame
-                while inner is not None and not _is_counted(inner.f_globals.get("__name__", "")):
+                while inner is not None and not self._is_counted(inner.f_globals.get("__name__", "")):
                     inner = inner.f_back
                 if inner is not None:
                     name = f"{inner.f_globals['__name__']}.{inner.f_code.co_qualname}".replace(".<locals>", "")
                     self.samples.setdefault(self.act, Counter())[name] += 1
-
-
-def _is_counted(module: str) -> bool:
-    """Whether samples are counted for a module's functions: the package's, but for the wrapper of every kernel."""
-    return module.startswith("slviewer.") and module != "slviewer.geometry.jit"
 
 
 _WAITING = ("threading.py", "selectors.py", "socket.py", "queue.py", "subprocess.py")

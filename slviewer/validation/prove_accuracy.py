@@ -23,7 +23,6 @@ from slviewer.evaluation.render import Row
 from slviewer.evaluation.sphere import SphereResult, evaluate_sphere
 from slviewer.fringe.phase import PhaseMap
 from slviewer.pipeline.feedback import Progress, ignore_progress, part
-from slviewer.pipeline.simulate import TARGET
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.reconstruction.reconstruct import Model
 from slviewer.simulation.boards import BoardShape
@@ -34,7 +33,12 @@ from slviewer.simulation.scenes import Spheres
 from slviewer.simulation.truth import PerfectModel
 from slviewer.target.board import Board
 from slviewer.validation.proof import BandCheck, Proof, prove_checks
-from slviewer.validation.rendered_calibration import calibrate_rendered, render_phase
+from slviewer.validation.rendered_calibration import (
+    DEFAULT_SETTINGS,
+    CalibrationSettings,
+    calibrate_rendered,
+    render_phase,
+)
 
 POSES = 25
 COVERED = 6
@@ -145,13 +149,20 @@ def prove_accuracy(
     *,
     rigs: Sequence[RigCase] | None = None,
     poses: int = POSES,
+    shapes: Sequence[str] = (),
+    settings: CalibrationSettings = DEFAULT_SETTINGS,
     seed: int = 0,
     progress: Progress = ignore_progress,
 ) -> Proof:
-    """Calibrate and measure one rig after another; by default the six of ``rig_cases``."""
+    """Calibrate and measure one rig after another; by default the six of ``rig_cases``.
+
+    ``shapes``: those of the Letter's planes and spheres that are measured; by default all.
+    """
     chosen = rig_cases(seed) if rigs is None else rigs
     figures = [
-        measure_rig(case, scale, poses, part(progress, i / len(chosen), (i + 1) / len(chosen), case.name))
+        measure_rig(
+            case, scale, poses, part(progress, i / len(chosen), (i + 1) / len(chosen), case.name), shapes, settings
+        )
         for i, case in enumerate(chosen)
     ]
     progress(1.0, "proven")
@@ -204,14 +215,25 @@ def _make_row(rig: RigFigures) -> Row:
     }
 
 
-def measure_rig(case: RigCase, scale: float, poses: int, progress: Progress = ignore_progress) -> RigFigures:
-    """Calibrate a rig from ``poses`` rendered captures of its board, and measure ten planes and six spheres with it."""
+def measure_rig(
+    case: RigCase,
+    scale: float,
+    poses: int,
+    progress: Progress = ignore_progress,
+    shapes: Sequence[str] = (),
+    settings: CalibrationSettings = DEFAULT_SETTINGS,
+) -> RigFigures:
+    """Calibrate a rig from ``poses`` rendered captures of its board, and measure shapes with it.
+
+    ``shapes``: names among the Letter's ten planes and six spheres; by default all.
+    """
     start = perf_counter()
     rig = case.rig(scale)
-    plan = letter_plan(rig, Board.parse(TARGET), poses, case.shape)
+    plan = letter_plan(rig, Board.parse(settings.target), poses, case.shape)
     targets = {name: scene for name, scene in plan.items() if name.startswith("pose_")}
-    shapes = {name: scene for name, scene in plan.items() if name.startswith(("plane_", "sphere_"))}
-    stereo, splined, observations = calibrate_rendered(rig, targets, progress=part(progress, 0.0, 0.6))
+    measurable = {name: scene for name, scene in plan.items() if name.startswith(("plane_", "sphere_"))}
+    measured_shapes = {name: scene for name, scene in measurable.items() if not shapes or name in shapes}
+    stereo, splined, observations = calibrate_rendered(rig, targets, part(progress, 0.0, 0.6), settings)
     pixelwise = calibrate_pixelwise(observations, stereo)
     models: dict[str, Model] = {
         "stereo": stereo,
@@ -223,9 +245,9 @@ def measure_rig(case: RigCase, scale: float, poses: int, progress: Progress = ig
     planes: dict[str, PlaneFigures] = {}
     spheres: dict[str, Spheres] = {}
     fits: dict[str, dict[str, SphereResult]] = {}
-    for i, (name, scene) in enumerate(shapes.items()):
-        progress(0.6 + 0.4 * i / len(shapes), name)
-        phase = render_phase(Renderer(rig, scene), name, list(plan).index(name))
+    for i, (name, scene) in enumerate(measured_shapes.items()):
+        progress(0.6 + 0.4 * i / len(measured_shapes), name)
+        phase = render_phase(Renderer(rig, scene), name, list(plan).index(name), settings)
         comparison, measured = compare_models(models, phase, covered, isinstance(scene, Spheres))
         if isinstance(scene, Spheres):
             spheres[name] = scene

@@ -1,12 +1,8 @@
 """Observations of the simulated rig without images: its own lenses say where features and bright places are seen."""
 
-from collections.abc import Iterator
-
 import numpy as np
-import pytest
 
 from slviewer.calibration.observe import Observation, Samples
-from slviewer.calibration.splined import fields
 from slviewer.fringe.phase import PhaseMap
 from slviewer.geometry.polynomial import fit_polynomial
 from slviewer.simulation.board_kernels import intersect
@@ -18,14 +14,8 @@ from slviewer.target.board import Board
 BOARD = Board.parse("circles:15x12:12")
 PERIOD = 18.0
 FEATURE_PX, SAMPLE_PX = 0.01, 0.006
-
-
-@pytest.fixture(scope="module", autouse=True)
-def coarse_knots() -> Iterator[None]:
-    """Half the knots each way: the coarse waves of the default rig need no more, and an adjustment takes a second."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(fields, "CELLS_ACROSS", 13)
-        yield
+CELLS = 13
+"""Half as many across an image as by default: the coarse waves of the rig need no more, and it takes a second."""
 
 
 def rig(seed: int = 0, local_distortion_px: float | None = None) -> SimulatedRig:

@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from analytic_rig import BOARD, PROJECTOR, board_poses, observation, rig
+from facts import missing_facts
 
 from slviewer.calibration.diagnosis.diagnose import DiagnosedCalibration, calibrate_with_diagnosis
 from slviewer.calibration.diagnosis.evidence import AxisEvidence, Evidence, PoseEvidence
@@ -56,13 +57,23 @@ def plane_rms_mm(found: DiagnosedCalibration, poses: list[Observation]) -> float
     return float(np.mean(rms))
 
 
+@pytest.mark.computes
 def test_a_sound_calibration_is_good() -> None:
     found = attempt(observations(8))
     assert found.verdict == Verdict() and found.verdict.level == "good" and found.verdict.reason == ""
     assert len(found.observations) == 8 and not found.excluded
 
 
-@pytest.mark.parametrize("order", ["transposed", "row", "mirrored", "noise", "bent", "moved"])
+@pytest.mark.computes
+@pytest.mark.parametrize(
+    "order",
+    [
+        "transposed",
+        "noise",
+        "moved",
+        *(pytest.param(each, marks=pytest.mark.slow) for each in ("row", "mirrored", "bent")),
+    ],
+)
 def test_one_bad_pose_of_twenty_is_named_and_changes_nothing(order: str) -> None:
     clean = observations()
     base = attempt(clean)
@@ -96,6 +107,7 @@ def test_one_bad_pose_of_twenty_is_named_and_changes_nothing(order: str) -> None
     assert plane_rms_mm(found, clean) == pytest.approx(plane_rms_mm(base, clean), rel=0.02)
 
 
+@pytest.mark.computes
 def test_what_cannot_be_used_is_kept_to_look_into_if_it_is_a_rig_at_all() -> None:
     bent = observations(6)
     for k, o in enumerate(bent):
@@ -104,7 +116,7 @@ def test_what_cannot_be_used_is_kept_to_look_into_if_it_is_a_rig_at_all() -> Non
     found = attempt(bent)
     assert found.verdict.level == "rejected" and found.verdict.causes[0] == "residuals"
     assert found.stereo is not None and found.stereo.reprojection_rms_px["stereo"] > 2
-    assert "reprojection error" in found.verdict.findings[0].sentence
+    assert missing_facts(found.verdict.findings[0].sentence, "reprojection error") == []
     exchanged = [dataclasses.replace(o, projector=o.projector[:, ::-1]) for o in observations(6)]
     evidence = [PoseEvidence(o.name, turn=fit_mean_turn(o.camera, o.projector)) for o in exchanged]
     found = calibrate_with_diagnosis(exchanged, evidence, PROJECTOR, BOARD)
@@ -113,16 +125,17 @@ def test_what_cannot_be_used_is_kept_to_look_into_if_it_is_a_rig_at_all() -> Non
 
 
 @pytest.mark.parametrize(
-    ("turn", "cause", "word"),
+    ("turn", "cause", "axes"),
     [
-        (((0.1, 1.5), (3.0, -0.1)), "axes-swapped", "exchanged"),
-        (((-1.5, 0.1), (0.1, 3.0)), "axis-reversed", "x axis"),
-        (((1.5, 0.1), (0.1, -3.0)), "axis-reversed", "y axis"),
+        (((0.1, 1.5), (3.0, -0.1)), "axes-swapped", ("x", "y")),
+        (((-1.5, 0.1), (0.1, 3.0)), "axis-reversed", ("x axis",)),
+        (((1.5, 0.1), (0.1, -3.0)), "axis-reversed", ("y axis",)),
     ],
 )
-def test_a_mirror_image_is_explained(turn: tuple, cause: str, word: str) -> None:
+def test_a_mirror_image_is_explained(turn: tuple, cause: str, axes: tuple[str, ...]) -> None:
     verdict = judge_evidence(Evidence("circles:21x16:9", (912, 1140), tuple(pose(k, turn=turn) for k in range(6))))
-    assert verdict.causes == (cause,) and verdict.level == "rejected" and word in verdict.reason
+    assert verdict.causes == (cause,) and verdict.level == "rejected"
+    assert missing_facts(verdict.reason, *axes) == []
 
 
 def test_a_projector_upside_down_is_sound() -> None:
@@ -166,7 +179,7 @@ def test_features_numbered_otherwise_are_seen_through_any_lens() -> None:
     assert describe_misnumbering(BOARD, seen.points, barrel) == ""
     index = np.arange(99).reshape(9, 11)
     for order, word in ((index.T, "transposed"), (np.roll(index, -1, 0), "row"), (np.roll(index, 1, 1), "column")):
-        assert word in describe_misnumbering(BOARD, seen.points, barrel[order.ravel()])
+        assert missing_facts(describe_misnumbering(BOARD, seen.points, barrel[order.ravel()]), word) == []
     shuffled = np.random.default_rng(3).permutation(99)
     assert describe_misnumbering(BOARD, seen.points, seen.camera[shuffled]) == "mixed up"
 
@@ -182,5 +195,5 @@ def test_evidence_and_verdicts_survive_saving() -> None:
     )
     assert verdict.causes == ("moved", "gamma") and verdict.level == "rejected"
     assert from_plain(json.loads(json.dumps(verdict.to_json())), Verdict) == verdict
-    assert "rejected: it: hold it" in verdict.text()
+    assert missing_facts(verdict.text(), "rejected", "it", "hold it") == []
     assert len(set(CAUSES)) == len(CAUSES)

@@ -59,6 +59,7 @@ def test_few_poses_tell_where_things_will_be_seen(true, seen, known) -> None:
     assert estimate_rig(points, camera, projector[1:] + projector[:1], sizes) is None  # of other poses
 
 
+@pytest.mark.computes
 def test_the_gain_of_a_pose_is_what_it_will_bring(bench, known) -> None:
     sensitivity = VolumeSensitivity.from_model(bench, depth_range(BOARD, bench.stereo.camera))
     rows = information_rows(bench, np.array(known[1]))

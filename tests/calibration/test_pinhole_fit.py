@@ -4,9 +4,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from splined_rig import BOARD, coarse_knots, observation, phase_map, poses, rig
+from facts import raises
+from splined_rig import BOARD, CELLS, observation, phase_map, poses, rig
 
-from slviewer.calibration.pinhole_fit import fit_lens, fit_splined
+from slviewer.calibration.pinhole_fit import MIN_PIXELS, fit_lens, fit_splined
 from slviewer.calibration.splined.model import SplinedModel, calibrate_splined
 from slviewer.calibration.stereo import StereoModel, calibrate_stereo
 from slviewer.errors import InputError
@@ -16,8 +17,6 @@ from slviewer.pipeline.models import frame_of, save_fitted, save_stereo, warn_if
 from slviewer.session.importers import opencv_calibration
 from slviewer.session.importers.filestorage import read_storage
 from slviewer.session.store import Session
-
-__all__ = ["coarse_knots"]  # a fixture for every test here
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +28,7 @@ def true():
 def models(true) -> tuple[StereoModel, SplinedModel]:
     seen = [observation(true, pose, f"pose_{i:02d}") for i, pose in enumerate(poses(true, 9))]
     stereo = calibrate_stereo(seen, true.projector.size, str(BOARD))
-    return stereo, calibrate_splined(seen, stereo)
+    return stereo, calibrate_splined(seen, stereo, cells_across=CELLS)
 
 
 def cloud_offsets(splined: SplinedModel, true, lens: Lens) -> np.ndarray:
@@ -55,7 +54,7 @@ def test_what_a_lens_cannot_express_is_stated() -> None:
     _, splined = _bent()
     camera, _ = fit_splined(splined)
     assert camera.max_px > camera.rms_px > 0.01
-    with pytest.raises(InputError, match="10"):
+    with raises(InputError, 10, MIN_PIXELS):
         fit_lens(np.zeros((10, 2)), np.zeros((10, 2)), camera.lens)
 
 
@@ -63,9 +62,10 @@ def _bent() -> tuple[StereoModel, SplinedModel]:
     bent = rig(seed=2)
     seen = [observation(bent, pose, f"pose_{i:02d}") for i, pose in enumerate(poses(bent, 9))]
     stereo = calibrate_stereo(seen, bent.projector.size, str(BOARD))
-    return stereo, calibrate_splined(seen, stereo)
+    return stereo, calibrate_splined(seen, stereo, cells_across=CELLS)
 
 
+@pytest.mark.computes
 def test_the_exported_file_is_the_models_own_and_names_its_frame(models, true, tmp_path: Path) -> None:
     stereo, splined = models
     warned: list[str] = []

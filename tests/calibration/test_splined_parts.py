@@ -2,7 +2,8 @@
 
 import numpy as np
 import pytest
-from splined_rig import BOARD, aligned_error, coarse_knots, observation, phase_map, poses, rig, surface
+from facts import raises
+from splined_rig import BOARD, CELLS, aligned_error, observation, phase_map, poses, rig, surface
 
 from slviewer.calibration.splined.adjust import adjust_bundle, gather_data
 from slviewer.calibration.splined.fields import (
@@ -19,8 +20,6 @@ from slviewer.calibration.splined.prior import Prior
 from slviewer.calibration.splined.unknowns import State, pinhole_lens
 from slviewer.calibration.stereo import calibrate_stereo
 from slviewer.errors import InputError
-
-__all__ = ["coarse_knots"]  # a fixture for every test here
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +39,7 @@ def stereo(seen, true):
 
 @pytest.fixture(scope="module")
 def model(seen, stereo):
-    return SplinedModel(adjust_bundle(seen, stereo))
+    return SplinedModel(adjust_bundle(seen, stereo, cells_across=CELLS))
 
 
 def bent(state: State, rng: np.random.Generator) -> State:
@@ -58,7 +57,7 @@ def test_every_derivative_agrees_with_differences(seen, stereo) -> None:
     rng = np.random.default_rng(0)
     few = [type(o)(**{**vars(o), "samples": _every(o.samples, 30)}) for o in seen[:3]]
     names, data, _ = gather_data(few, stereo)
-    state = bent(State.from_stereo(stereo, names, len(data.points)), rng)
+    state = bent(State.from_stereo(stereo, names, len(data.points), CELLS), rng)
     at = state.layout
     residuals = tuple(rng.normal(size=p.shape) for p in predict_observations(state, data))
     weights = tuple(rng.random(r.shape) for r in residuals)
@@ -86,11 +85,12 @@ def test_every_derivative_agrees_with_differences(seen, stereo) -> None:
     assert np.abs(((J * W) @ J.T - A[np.ix_(chosen, chosen)]) / (scale[:, None] * scale)).max() < 1e-5
 
 
+@pytest.mark.computes
 @pytest.mark.parametrize("damping", [0.0, 0.3])
 def test_a_factor_by_blocks_solves_the_normal_equations(seen, stereo, damping: float) -> None:
     rng = np.random.default_rng(5)
     names, data, _ = gather_data(seen[:4], stereo)
-    state = bent(State.from_stereo(stereo, names, len(data.points)), rng)
+    state = bent(State.from_stereo(stereo, names, len(data.points), CELLS), rng)
     residuals = tuple(rng.normal(size=p.shape) for p in predict_observations(state, data))
     A, b = normal_equations(state, data, residuals, tuple(rng.random(r.shape) for r in residuals))
     Prior.build(state, data).add(A, b, state, (10.0, 20.0))
@@ -147,6 +147,7 @@ def test_the_compiled_form_is_the_exact_one(model, true) -> None:
     assert np.abs(model.rays[:, height // 2, width // 2] - central).max() < 1e-3
 
 
+@pytest.mark.computes
 def test_depth_noise_follows_from_the_phase_noise(model, true) -> None:
     z = np.full(true.camera.size[::-1], 600.0)
     phase = phase_map(true, z)
@@ -174,6 +175,7 @@ def exact_point(state: State, pixel: np.ndarray, coordinate: float, guess: float
     return np.array([*undistort_pixel(state.rig.camera, *pixel, np.zeros((4, 4))), 1.0]) * depth
 
 
+@pytest.mark.computes
 def test_points_answer_to_the_unknowns_as_differences_say(model) -> None:
     bundle = model.bundle
     at = bundle.state.layout
@@ -190,10 +192,11 @@ def test_points_answer_to_the_unknowns_as_differences_say(model) -> None:
         for s in (step, -step)
     )
     assert np.allclose((ahead - behind).ravel() / 2, J @ rig_step, rtol=1e-4, atol=1e-9)
-    with pytest.raises(InputError, match="axis"):
+    with raises(InputError, "axis", "z"):
         bundle.point_jacobian("z", pixels, z)  # type: ignore[arg-type]
 
 
+@pytest.mark.computes
 def test_the_covariance_predicts_true_errors_once_rigid_motion_is_removed(model, true) -> None:
     shape = true.camera.size[::-1]
     found, truth, pixels, depths = [], [], [], []

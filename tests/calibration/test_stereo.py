@@ -6,9 +6,13 @@ import cv2
 import numpy as np
 import pytest
 from analytic_rig import BOARD, PROJECTOR, board_poses, observation, rig
+from facts import missing_facts, raises
 
+from slviewer.calibration.soundness import MIN_POSES
 from slviewer.calibration.stereo import StereoModel, calibrate_stereo
 from slviewer.errors import CalibrationRejected
+
+pytestmark = pytest.mark.computes
 
 TRUE = rig()
 
@@ -70,12 +74,12 @@ def test_single_wrong_features_are_set_aside(model: StereoModel) -> None:
 def test_a_pose_of_one_axis_is_left_out() -> None:
     poses = observations()
     poses[2] = observation(TRUE, board_poses(12)[2], "pose_02", axes=("x",))
-    assert "both x and y" in calibrate_stereo(poses, PROJECTOR).excluded["pose_02"]
+    assert missing_facts(calibrate_stereo(poses, PROJECTOR).excluded["pose_02"], "x", "y") == []
 
 
 @pytest.mark.parametrize("count", [0, 1, 2])
 def test_too_few_poses_are_rejected(count: int) -> None:
-    with pytest.raises(CalibrationRejected, match=f"{count} "):
+    with raises(CalibrationRejected, count, MIN_POSES):
         calibrate_stereo(observations(12)[:count], PROJECTOR)
 
 
@@ -85,7 +89,7 @@ def test_parallel_poses_are_rejected() -> None:
         T = np.eye(4)
         T[:3, 3] = np.array([-15.0 + 3 * k, 2.0 * k - 8, 520 + 22 * k]) - BOARD.points.mean(0)
         poses.append(observation(TRUE, T, f"pose_{k}"))
-    with pytest.raises(CalibrationRejected, match="parallel"):
+    with raises(CalibrationRejected, "parallel", 8):
         calibrate_stereo(poses, PROJECTOR)
 
 
@@ -95,10 +99,10 @@ def test_a_mirrored_projector_is_rejected_and_one_upside_down_is_not(turned: lis
         middle = np.array(PROJECTOR) / 2 - 0.5
         return [dataclasses.replace(o, projector=(o.projector - middle) * signs + middle) for o in observations(6)]
 
-    with pytest.raises(CalibrationRejected, match="mirror"):
+    with raises(CalibrationRejected, "mirror", 6):
         calibrate_stereo(projected(np.array(turned)), PROJECTOR)
     exchanged = [dataclasses.replace(o, projector=o.projector[:, ::-1]) for o in observations(6)]
-    with pytest.raises(CalibrationRejected, match="x and y"):
+    with raises(CalibrationRejected, "x and y"):
         calibrate_stereo(exchanged, PROJECTOR)
     upside_down = calibrate_stereo(projected(np.array([-1.0, -1.0])), PROJECTOR)
     assert upside_down.reprojection_rms_px["stereo"] < 0.03

@@ -2,18 +2,20 @@
 
 import tomllib
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
 from artefact_places import bar_places, plane_places, sphere_places
+from facts import missing_facts, raises
 
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import InputError
 from slviewer.evaluation.acceptance.artefact import Artefact, Limits
 from slviewer.evaluation.acceptance.figures import AcceptanceFigure, decide, narrowest_range
 from slviewer.evaluation.acceptance.measure import FLATNESS, FORM, SIZE, SPACING, measure
-from slviewer.evaluation.acceptance.result import conclude_test
+from slviewer.evaluation.acceptance.result import CLAIM, conclude_test
 from slviewer.evaluation.budget import Contribution, ErrorBudget
 from slviewer.evaluation.repeatability import repeatability
 from slviewer.fringe.decode import decode
@@ -63,11 +65,15 @@ def bar(T: np.ndarray, spacing: float = 100.0) -> Spheres:
     return Spheres(T[:3, 3] + spacing / 2 * np.array([[-1.0], [1.0]]) * T[:3, 0], 19.05)
 
 
+@cache
+def places_of_the_bar():
+    return bar_places(RIG, R2, 100.0, 38.1)
+
+
 @pytest.fixture(scope="module")
 def bars():
     """(words, phases) of the ball bar in its seven places."""
-    places = bar_places(RIG, R2, 100.0, 38.1)
-    return [(p.words, phases_of(bar(p.T_camera_artefact), i)) for i, p in enumerate(places)]
+    return [(p.words, phases_of(bar(p.T_camera_artefact), i)) for i, p in enumerate(places_of_the_bar())]
 
 
 def outcome(artefact, bars, model):
@@ -107,14 +113,16 @@ def test_a_scale_error_of_200_ppm_is_found(bars, true_test):
     assert low < 200 < high and wrong.scale.U_ppm < 150
 
 
+@pytest.mark.computes
 def test_temperature_is_corrected(bars):
     warm = {**GIVEN, "measured": {**GIVEN["measured"], "temperature_C": 30.0}}
     cold, hot = (outcome(Artefact.from_dict(given), bars[:2], true_model()) for given in (GIVEN, warm))
     assert cold.scale.ppm - hot.scale.ppm == pytest.approx(115, abs=0.5)
     assert hot.positions[0].error(SPACING).U_mm > cold.positions[0].error(SPACING).U_mm
-    assert "2 of 7 positions" in hot.text()
+    assert hot.lacks and missing_facts(hot.text(), "2 of 7") == []
 
 
+@pytest.mark.computes
 @pytest.mark.parametrize(("limit", "decision"), [(0.2, "pass"), (0.012, "undecided"), (1e-5, "fail")])
 def test_decisions_heed_the_tests_own_uncertainty(true_test, limit, decision):
     unsure = Artefact.from_dict({**GIVEN, "calibrated": {**GIVEN["calibrated"], "spacing_U_mm": 0.01}})
@@ -124,15 +132,16 @@ def test_decisions_heed_the_tests_own_uncertainty(true_test, limit, decision):
     u = unsure.at_measurement(unsure.spacing)[1]
     assert decide([AcceptanceFigure.of_length(SPACING, "", error, u) for error in errors], limit) == decision
     judged = conclude_test(replace(unsure, limits=Limits(spacing_mm=limit)), "stereo", true_test.positions)
-    assert judged.decision in ("pass", "fail", "undecided") and judged.decision.upper() in judged.text()
-    assert "claims conformity with neither" in judged.text()
+    assert judged.decision in ("pass", "fail", "undecided")
+    assert missing_facts(judged.text(), judged.decision.upper(), CLAIM) == []
 
 
 @pytest.mark.computes
-def test_planes_are_flat_to_their_noise():
+@pytest.mark.parametrize("count", [2, pytest.param(6, marks=pytest.mark.slow)])
+def test_planes_are_flat_to_their_noise(count):
     artefact = Artefact.from_dict(tomllib.loads((EXAMPLES / "plane.toml").read_text()))
     found = []
-    for i, place in enumerate(plane_places(RIG, R2)):
+    for i, place in enumerate(plane_places(RIG, R2)[:count]):
         T = place.T_camera_artefact
         plate = blank_board(Pose(T[:3, :3], T[:3, 3]), (140.0, 110.0))
         cloud = reconstruct(true_model(), phases_of(plate, 50 + i))
@@ -142,15 +151,17 @@ def test_planes_are_flat_to_their_noise():
         assert position.rms_mm[0] == pytest.approx(position.floor_mm[0], rel=0.08)
         width = position.error(FLATNESS).within_95_mm[1]
         assert width == pytest.approx(2 * 1.96 * position.rms_mm[0], rel=0.2)
-    assert test.scale is None and test.decision == "pass" and test.lacks == ()
+    assert test.scale is None and test.decision == "pass" and (test.lacks == ()) == (count == 6)
 
 
+@pytest.mark.computes
 def test_places_are_seen_by_both_devices():
-    for place in bar_places(RIG, R2, 100.0, 38.1) + sphere_places(RIG, R2, 60.0):
+    bar_held, sphere_held = places_of_the_bar(), sphere_places(RIG, R2, 60.0)
+    for place in bar_held + sphere_held:
         T = place.T_camera_artefact
         assert np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3)) and np.linalg.det(T[:3, :3]) == pytest.approx(1)
-    assert len(bar_places(RIG, R2, 100.0, 38.1)) == 7 and len(plane_places(RIG, R2)) == 6
-    depths = [place.T_camera_artefact[2, 3] for place in sphere_places(RIG, R2, 60.0)]
+    assert len(bar_held) == 7 and len(plane_places(RIG, R2)) == 6
+    depths = [place.T_camera_artefact[2, 3] for place in sphere_held]
     assert min(depths) < R2[0] and max(depths) > R2[1]
     with pytest.raises(InputError):
         bar_places(RIG, R2, 400.0, 38.1)
@@ -169,18 +180,18 @@ def test_the_examples_are_valid(name):
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "facts"),
     [
-        ({"kind": "cube"}, "use ball-bar, sphere or plane"),
-        ({"measured": {"temperature_C": 20.0, "temperature_U_K": 0.1}}, "names no captures"),
-        ({"calibrated": {**GIVEN["calibrated"], "spacing_mm": -1}}, "impossible"),
-        ({"calibrated": {**GIVEN["calibrated"], "spacing_mm": "100"}}, "give a number"),
-        ({"calibrated": {**GIVEN["calibrated"], "diameter_mm": [1.0, 2.0, 3.0]}}, "3 diameters"),
-        ({"limits": {"colour": 1}}, "unknown"),
+        ({"kind": "cube"}, ["kind", "cube", "ball-bar", "sphere", "plane"]),
+        ({"measured": {"temperature_C": 20.0, "temperature_U_K": 0.1}}, ["[measured]", "captures"]),
+        ({"calibrated": {**GIVEN["calibrated"], "spacing_mm": -1}}, ["spacing_mm", -1]),
+        ({"calibrated": {**GIVEN["calibrated"], "spacing_mm": "100"}}, ["spacing_mm", "'100'"]),
+        ({"calibrated": {**GIVEN["calibrated"], "diameter_mm": [1.0, 2.0, 3.0]}}, [3, "diameters", 2]),
+        ({"limits": {"colour": 1}}, ["[limits]", "colour"]),
     ],
 )
-def test_artefacts_that_make_no_sense_are_refused(change, said):
-    with pytest.raises(InputError, match=said):
+def test_artefacts_that_make_no_sense_are_refused(change, facts):
+    with raises(InputError, *facts):
         Artefact.from_dict({**GIVEN, **change})
 
 
@@ -193,7 +204,7 @@ def test_repeatability_is_the_noise_whatever_the_shape():
     assert found.sigma_mm == pytest.approx(0.03, rel=0.06) and found.predicted_mm == pytest.approx(0.03)
     assert found.wandering_mm == pytest.approx(0.009, abs=0.003)
     assert found.pixels == 55 * 80 and np.isnan(found.sigma_map[0, 0])
-    with pytest.raises(InputError, match=r"\b2\b"):
+    with raises(InputError, 2):
         repeatability([(shape, noise)] * 2)
 
 
@@ -203,4 +214,4 @@ def test_a_budget_adds_squares_and_names_what_is_unknown():
         [Contribution("a", 0.003, "A", ""), Contribution("b", 0.004, "B", ""), Contribution("drift", None, "B", "")],
     )
     assert found.U_mm == pytest.approx(0.010) and found.unknown == ("drift",)
-    assert "WITHOUT drift" in found.text()
+    assert missing_facts(found.text(), "without", *found.unknown) == []

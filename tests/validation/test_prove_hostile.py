@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from facts import raises
 
 from slviewer.errors import InputError, UsageError
 from slviewer.simulation.hostile import FAULTS
@@ -53,11 +54,12 @@ def test_cases_are_chosen_by_name():
     assert len(choose_cases()) >= 60 and len({name for name, _, _ in choose_cases()}) >= 22
     assert choose_cases(["jpeg:mild"]) == [("jpeg", "mild", "scan"), ("jpeg", "mild", "calibration")]
     assert len(choose_cases(["gamma::scan", "flicker"])) == 9
-    with pytest.raises(UsageError, match="jpg"):
+    with raises(UsageError, "jpg"):
         choose_cases(["jpg"])
 
 
 @pytest.mark.computes
+@pytest.mark.slow
 def test_three_cases_end_to_end():
     proof = prove_hostile(
         0.15, cases=["vignetting:mild:scan", "dropped-frame:medium:scan", "hand:mild:scan"], splined=False

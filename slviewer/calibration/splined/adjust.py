@@ -79,23 +79,31 @@ def gather_data(observations: Sequence[Observation], stereo: StereoModel) -> tup
 
 
 def adjust_bundle(
-    observations: Sequence[Observation], stereo: StereoModel, progress: Callable[[float], None] | None = None
+    observations: Sequence[Observation],
+    stereo: StereoModel,
+    progress: Callable[[float], None] | None = None,
+    *,
+    cells_across: int | None = None,
 ) -> Bundle:
     """Adjust devices, board and poses jointly, from the observations that the stereo calibration used.
 
+    ``cells_across``: cells of each displacement field across its image; by default ``fields.CELLS_ACROSS``.
     Raises InputError as ``gather_data`` does, and CalibrationRejected where the adjustment does not converge, is
     undetermined, or where too few poses agree with each other.
     """
     with threadpool_limits(numba.get_num_threads(), user_api="blas"):  # for one large matrix, not for many small ones
-        return _adjust(observations, stereo, progress)
+        return _adjust(observations, stereo, progress, cells_across)
 
 
 def _adjust(
-    observations: Sequence[Observation], stereo: StereoModel, progress: Callable[[float], None] | None
+    observations: Sequence[Observation],
+    stereo: StereoModel,
+    progress: Callable[[float], None] | None,
+    cells_across: int | None,
 ) -> Bundle:
     """Do what ``adjust_bundle`` does, with the present number of threads."""
     names, data, sample_sigma = gather_data(observations, stereo)
-    state = State.from_stereo(stereo, names, len(data.points))
+    state = State.from_stereo(stereo, names, len(data.points), cells_across)
     layout = state.layout
     prior = Prior.build(state, data)
     strengths = [FIRST_STRENGTH, FIRST_STRENGTH]

@@ -27,14 +27,15 @@ class Device(NamedTuple):
     size: np.ndarray
 
 
-def cells_for(size: tuple[int, int]) -> tuple[int, int]:
-    """Cells (across, down) of an image of ``size``: square ones where pixels are."""
-    return CELLS_ACROSS, int(np.clip(round(CELLS_ACROSS * size[1] / size[0]), 6, 2 * CELLS_ACROSS))
+def cells_for(size: tuple[int, int], cells_across: int | None = None) -> tuple[int, int]:
+    """Cells (across, down) of an image of ``size``: square ones where pixels are; ``CELLS_ACROSS`` by default."""
+    across = CELLS_ACROSS if cells_across is None else cells_across
+    return across, int(np.clip(round(across * size[1] / size[0]), 6, 2 * across))
 
 
-def no_displacement(size: tuple[int, int]) -> np.ndarray:
-    """Coefficients of W = 0."""
-    across, down = cells_for(size)
+def no_displacement(size: tuple[int, int], cells_across: int | None = None) -> np.ndarray:
+    """Coefficients of W = 0, on the cells of ``cells_for``."""
+    across, down = cells_for(size, cells_across)
     return np.zeros((2, down + 3, across + 3))
 
 

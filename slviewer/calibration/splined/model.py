@@ -259,10 +259,15 @@ class SplinedModel:
 
 
 def calibrate_splined(
-    observations: Sequence[Observation], stereo: StereoModel, progress: Callable[[float], None] | None = None
+    observations: Sequence[Observation],
+    stereo: StereoModel,
+    progress: Callable[[float], None] | None = None,
+    *,
+    cells_across: int | None = None,
 ) -> SplinedModel:
     """Calibrate the splined model from the poses that the stereo calibration used.
 
+    ``cells_across``: cells of each displacement field across its image; by default ``fields.CELLS_ACROSS``.
     Raises InputError where poses lack an axis, and CalibrationRejected where they contradict each other.
     """
-    return SplinedModel(adjust_bundle(observations, stereo, progress))
+    return SplinedModel(adjust_bundle(observations, stereo, progress, cells_across=cells_across))

@@ -91,11 +91,16 @@ class State:
     offsets: NDArray[np.float64]
 
     @classmethod
-    def from_stereo(cls, stereo: StereoModel, poses: list[str], features: int) -> "State":
-        """Return the initial state from a stereo calibration: no displacement, a flat board."""
+    def from_stereo(
+        cls, stereo: StereoModel, poses: list[str], features: int, cells_across: int | None = None
+    ) -> "State":
+        """Return the initial state from a stereo calibration: no displacement, a flat board.
+
+        ``cells_across``: cells of each displacement field across its image; by default ``fields.CELLS_ACROSS``.
+        """
         rig = stereo.rig
         devices = [
-            Device(lens.parameters, no_displacement(lens.size), np.array(lens.size, float))
+            Device(lens.parameters, no_displacement(lens.size, cells_across), np.array(lens.size, float))
             for lens in (rig.camera, rig.projector)
         ]
         T = np.array([stereo.poses[name] for name in poses])
