@@ -1,8 +1,10 @@
-"""The whole wizard, flown once on a small rig; then everything that can be looked at, exported and undone."""
+"""The autopilot runs the wizard on a small rig; then everything that can be looked at, exported and undone."""
 
 import importlib
+import shutil
 import zipfile
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +27,17 @@ from slviewer.wizard.snapshot import SessionView, Snapshot
 pytestmark = pytest.mark.computes
 
 RIG = {"driver": "simulated", "scale": 0.25, "seed": 0}
+POSES = 8
+
+
+@contextmanager
+def flown(folder: Path, acts: list[str]) -> Iterator[Operator]:
+    """An operator of the session in this folder, in which the autopilot has done its acts."""
+    with pytest.MonkeyPatch.context() as patch, Operator(folder, RIG, timing=SPARING) as operator:
+        patch.setattr(fields, "CELLS_ACROSS", 12)  # a hundredth of the time to solve, and as good for this rig
+        operator.choose_patterns("p18")
+        Autopilot(operator, poses=POSES, patience_s=HANG_S, before=acts.append).run()
+        yield operator
 
 
 @pytest.fixture(scope="module")
@@ -33,11 +46,15 @@ def acts() -> list[str]:
 
 
 @pytest.fixture(scope="module")
-def operator(tmp_path_factory: pytest.TempPathFactory, acts: list[str]) -> Iterator[Operator]:
+def operator(recorded: Path, tmp_path_factory: pytest.TempPathFactory, acts: list[str]) -> Iterator[Operator]:
+    """After all acts of the autopilot, which found all poses but the last in its session."""
     folder = tmp_path_factory.mktemp("flight") / "session"
-    with pytest.MonkeyPatch.context() as patch, Operator(folder, RIG, timing=SPARING) as operator:
-        patch.setattr(fields, "CELLS_ACROSS", 12)  # a hundredth of the time to solve, and as good for this rig
-        Autopilot(operator, poses=8, patience_s=HANG_S, before=acts.append).run()
+    with Session.create(folder):
+        pass
+    for pose in (f"pose_{i:02d}" for i in range(1, POSES)):
+        for place in (f"captures/{pose}", f"results/poses/{pose}"):
+            shutil.copytree(recorded / "session" / place, folder / place)
+    with flown(folder, acts) as operator:
         yield operator
 
 
@@ -46,8 +63,21 @@ def session_of(snapshot: Snapshot) -> SessionView:
     return snapshot.session
 
 
-def test_the_flight_reaches_a_merged_ply(operator: Operator, acts: list[str]) -> None:
-    snapshot = operator.snapshot()
+def test_the_flight_from_recorded_poses_reaches_a_merged_ply(operator: Operator, acts: list[str]) -> None:
+    assert_all_is_measured(operator.snapshot(), acts)
+    assert "Capturing pose 7 of 8" not in acts
+
+
+@pytest.mark.slow
+def test_the_flight_reaches_a_merged_ply(tmp_path: Path) -> None:
+    acts: list[str] = []
+    with flown(tmp_path / "session", acts) as operator:
+        assert_all_is_measured(operator.snapshot(), acts)
+    assert "Capturing pose 1 of 8" in acts
+
+
+def assert_all_is_measured(snapshot: Snapshot, acts: list[str]) -> None:
+    """Assert that the autopilot has calibrated, verified, scanned, merged and measured."""
     session = session_of(snapshot)
     assert [step.state for step in snapshot.steps] == ["done"] * 9
     assert list_texts(snapshot, "error") == []

@@ -42,6 +42,7 @@ def turned(snapshot: Snapshot | None) -> list[tuple[str, float, str]]:
     return [(s.name, s.turn_step.deg, s.cloud) for s in snapshot.session.scans if s.turn_step is not None]
 
 
+@pytest.mark.slow
 def test_one_request_ends_in_a_watertight_mesh(operator: Operator) -> None:
     assert operator.snapshot().rig.turntable == "the simulated turntable"
     stages: set[str] = set()
