@@ -143,11 +143,25 @@ def test_panels_find_what_they_draw(operator: Operator) -> None:
 @pytest.mark.parametrize(
     ("where", "make"),
     [
-        ("calibrate.calibrate_pixelwise", lambda store, r: tasks.calibrate_session(store, TARGET, r, print)),
-        ("poses.observe", lambda store, r: tasks.calibrate_session(store, TARGET, r, print)),
+        pytest.param(
+            "calibrate.calibrate_pixelwise",
+            lambda store, r: tasks.calibrate_session(store, TARGET, r, print),
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            "poses.observe", lambda store, r: tasks.calibrate_session(store, TARGET, r, print), marks=pytest.mark.slow
+        ),
         ("capture_clouds.reconstruct", lambda store, r: tasks.reconstruct_capture(store, "scan_01", None, r, print)),
-        ("merge.fuse", lambda store, r: tasks.merge_scans(store, ["scan_01"], "scan_02", r, print)),
-        ("verify.compare", lambda store, r: tasks.verify_captures(store, ["plane_01"], "plane", None, r, print)),
+        pytest.param(
+            "merge.fuse",
+            lambda store, r: tasks.merge_scans(store, ["scan_01"], "scan_02", r, print),
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            "verify.compare",
+            lambda store, r: tasks.verify_captures(store, ["plane_01"], "plane", None, r, print),
+            marks=pytest.mark.slow,
+        ),
     ],
 )
 def test_work_given_up_inside_a_long_call_saves_nothing(
@@ -209,6 +223,7 @@ def read_head(path: Path) -> str:
         return file.read(1000).decode("ascii", "replace")
 
 
+@pytest.mark.slow
 def test_a_scale_that_was_applied_is_in_the_clouds_and_makes_older_ones_stale(operator: Operator) -> None:
     store = operator.session
     assert store is not None
@@ -231,6 +246,7 @@ def test_a_scale_that_was_applied_is_in_the_clouds_and_makes_older_ones_stale(op
     assert operator.choose_model("") and not operator.choose_model("anchored")
 
 
+@pytest.mark.slow
 def test_what_changes_makes_stale_what_came_from_it(operator: Operator) -> None:
     assert operator.exclude("pose_02")
     stale = operator.wait_until_idle(HANG_S)

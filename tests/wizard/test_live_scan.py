@@ -117,6 +117,7 @@ def test_clouds_stream_are_kept_and_give_way_to_a_capture(wizard: Wizard) -> Non
     assert [(s.label, s.cloud) for s in after.session.scans] == [("a <b>face</b>", "fresh"), ("scan_02", "fresh")]
 
 
+@pytest.mark.slow
 def test_stopping_frees_the_devices_and_starting_again_goes_on(wizard: Wizard) -> None:
     operator = wizard.operator
     for _ in range(2):

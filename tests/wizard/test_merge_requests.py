@@ -73,6 +73,7 @@ def off_mm(merge: MergeView, name: str) -> float:
     return float(np.linalg.norm(D[:3, :3] @ MIDDLE + D[:3, 3] - MIDDLE))
 
 
+@pytest.mark.slow
 def test_three_scans_close_a_loop_and_say_how_sure_they_are(operator: Operator) -> None:
     assert operator.merge(NAMES, "first")
     snapshot, merge = settled(operator)
@@ -97,6 +98,7 @@ def test_three_scans_close_a_loop_and_say_how_sure_they_are(operator: Operator) 
 
 
 def test_a_turntable_is_told_by_its_angle_and_a_wrong_one_is_refused_until_the_next_try(operator: Operator) -> None:
+    assert operator.merge(NAMES[:2], "first", start="turntable", angle=STEP_DEG)
     before = settled(operator)[1]
     assert operator.merge(NAMES[:2], "first", start="turntable", angle=40.0)
     snapshot, merge = settled(operator)
@@ -153,6 +155,7 @@ def test_a_merge_of_before_that_kept_less_is_shown(tmp_path: Path) -> None:
     assert shown.turned_deg == pytest.approx(5) and view.loops == () and view.shared is None and view.stale
 
 
+@pytest.mark.slow
 def test_scans_are_aligned_as_they_come_and_merged_from_there(operator: Operator) -> None:
     store = operator.session
     assert store is not None

@@ -36,6 +36,7 @@ def lacks(operator: Operator, *facts: object) -> list[str]:
     return missing_facts(notice.text, *facts)
 
 
+@pytest.mark.slow
 def test_poses_in_several_exposures_are_judged_as_others_are(operator: Operator) -> None:
     once = operator.wait_until_idle()
     assert once.rig.exposure_ms == 0.8 and once.session is not None and once.session.exposures_ms == ()
