@@ -31,11 +31,11 @@ POSES = 8
 
 
 @contextmanager
-def flown(folder: Path, acts: list[str]) -> Iterator[Operator]:
+def flown(folder: Path, patterns: str, acts: list[str]) -> Iterator[Operator]:
     """An operator of the session in this folder, in which the autopilot has done its acts."""
     with pytest.MonkeyPatch.context() as patch, Operator(folder, RIG, timing=SPARING) as operator:
         patch.setattr(fields, "CELLS_ACROSS", 12)  # a hundredth of the time to solve, and as good for this rig
-        operator.choose_patterns("p18")
+        operator.choose_patterns(patterns)
         Autopilot(operator, poses=POSES, patience_s=HANG_S, before=acts.append).run()
         yield operator
 
@@ -54,7 +54,7 @@ def operator(recorded: Path, tmp_path_factory: pytest.TempPathFactory, acts: lis
     for pose in (f"pose_{i:02d}" for i in range(1, POSES)):
         for place in (f"captures/{pose}", f"results/poses/{pose}"):
             shutil.copytree(recorded / "session" / place, folder / place)
-    with flown(folder, acts) as operator:
+    with flown(folder, "p18", acts) as operator:
         yield operator
 
 
@@ -71,7 +71,7 @@ def test_the_flight_from_recorded_poses_reaches_a_merged_ply(operator: Operator,
 @pytest.mark.slow
 def test_the_flight_reaches_a_merged_ply(tmp_path: Path) -> None:
     acts: list[str] = []
-    with flown(tmp_path / "session", acts) as operator:
+    with flown(tmp_path / "session", "complementary", acts) as operator:
         assert_all_is_measured(operator.snapshot(), acts)
     assert "Capturing pose 1 of 8" in acts
 

@@ -20,7 +20,6 @@ from slviewer.wizard.snapshot import PreviewView, Snapshot
 pytestmark = pytest.mark.computes
 
 RIG = {"driver": "simulated", "scale": 0.2, "seed": 0}
-PATTERNS = "p18"
 TARGET = "circles:21x16:9"
 ROOT = Path(__file__).parents[3]
 
@@ -34,7 +33,6 @@ def rigs() -> FaultyRigs:
 def operator(tmp_path: Path, rigs: FaultyRigs) -> Iterator[Operator]:
     with Operator(tmp_path / "session", RIG, set_up=rigs, timing=SPARING) as operator:
         operator.choose_target(TARGET)
-        operator.choose_patterns(PATTERNS)
         wait_until_open(operator)
         yield operator
 
@@ -67,7 +65,7 @@ def test_poses_are_judged_kept_and_found_again(operator: Operator, rigs: FaultyR
     operator.subscribe(lambda snapshot: versions.append(snapshot.version))
     before = operator.wait_until_idle()
     assert before.session is not None and before.session.suggestion is not None and before.world is not None
-    assert before.space is not None and before.space.capture_bytes == 18 * 320 * 240
+    assert before.space is not None and before.space.capture_bytes == 32 * 320 * 240
     for _ in range(2):
         assert operator.place_at_suggestion() and operator.capture_pose()
         after = operator.wait_until_idle()
@@ -116,7 +114,7 @@ def test_a_device_that_fails_leaves_no_half_capture(operator: Operator, rigs: Fa
     assert store is not None and operator.place_at_suggestion()
     rigs.faults.plan(fault, 12)
     assert operator.capture_pose()
-    assert operator.wait_for(lambda s: any(not missing_facts(n.text, "13 of 18") for n in s.notices), HANG_S)
+    assert operator.wait_for(lambda s: any(not missing_facts(n.text, "13 of 32") for n in s.notices), HANG_S)
     assert operator.wait_for(lambda s: s.notices[-1].level == "good" and s.rig.fault == "", HANG_S)
     assert store.capture_names() == [] and list((store.folder / "captures").iterdir()) == []
     wait_until_open(operator)
@@ -131,11 +129,11 @@ def test_a_capture_that_is_killed_leaves_every_earlier_pose(tmp_path: Path) -> N
 from slviewer.wizard.operator import Operator
 operator = Operator({str(tmp_path / "session")!r}, {RIG!r})
 operator.choose_target({TARGET!r})
-operator.choose_patterns({PATTERNS!r})
 operator.wait_for(lambda s: s.rig.state == "open", 60)
 operator.place_at_suggestion()
 operator.capture_pose()
 operator.wait_until_idle()
+operator.choose_patterns("p18")
 operator.subscribe(lambda s: print(s.rig.capture.frame if s.rig.capture else "", flush=True))
 operator.capture_pose()
 operator.wait_until_idle()
@@ -158,7 +156,6 @@ def test_hands_free_captures_a_board_that_is_held_still_once(tmp_path: Path) -> 
     previews: list[PreviewView] = []
     with Operator(tmp_path / "session", RIG, timing=timing) as operator:
         operator.choose_target(TARGET)
-        operator.choose_patterns(PATTERNS)
         wait_until_open(operator)
         operator.subscribe(lambda s: None, previews.append)
         operator.place_at_suggestion()
