@@ -52,7 +52,7 @@ def operator(recorded: Path, tmp_path_factory: pytest.TempPathFactory, acts: lis
     with Session.create(folder):
         pass
     for pose in (f"pose_{i:02d}" for i in range(1, POSES)):
-        for place in (f"captures/{pose}", f"results/poses/{pose}"):
+        for place in (f"captures/{pose}", *(f"results/{made}/{pose}" for made in ("poses", "evidence", "trust"))):
             shutil.copytree(recorded / "session" / place, folder / place)
     with flown(folder, "p18", acts) as operator:
         yield operator
