@@ -98,7 +98,7 @@ def test_what_leaves_nothing_is_refused_with_numbers(operator: Operator) -> None
     operator.reconstruct("two")
     session = view(operator)
     assert session.scans[1].cloud == "absent"
-    assert any(not missing_facts(notice.text, "two", "region", 9000) for notice in operator.notices())
+    assert any(not missing_facts(notice.text, "two", "region", "9000.0") for notice in operator.notices())
     assert operator.switch_region(False)
     operator.reconstruct("two")
     assert view(operator).scans[1].cloud == "fresh"
