@@ -19,7 +19,7 @@ from slviewer.wizard.snapshot import PreviewView, Snapshot
 
 pytestmark = pytest.mark.computes
 
-RIG = {"driver": "simulated", "scale": 0.2, "seed": 0}
+RIG = {"driver": "simulated", "scale": 0.25, "seed": 0}
 TARGET = "circles:21x16:9"
 ROOT = Path(__file__).parents[3]
 
@@ -65,7 +65,7 @@ def test_poses_are_judged_kept_and_found_again(operator: Operator, rigs: FaultyR
     operator.subscribe(lambda snapshot: versions.append(snapshot.version))
     before = operator.wait_until_idle()
     assert before.session is not None and before.session.suggestion is not None and before.world is not None
-    assert before.space is not None and before.space.capture_bytes == 32 * 320 * 240
+    assert before.space is not None and before.space.capture_bytes == 32 * 400 * 300
     for _ in range(2):
         assert operator.place_at_suggestion() and operator.capture_pose()
         after = operator.wait_until_idle()

@@ -17,7 +17,7 @@ from slviewer.wizard.operator import Operator
 
 pytestmark = pytest.mark.computes
 
-RIG = {"driver": "simulated", "scale": 0.2, "seed": 0, "exposure_ms": 0.8}
+RIG = {"driver": "simulated", "scale": 0.25, "seed": 0, "exposure_ms": 0.8}
 
 
 @pytest.fixture
@@ -106,14 +106,14 @@ def test_a_rig_chosen_once_more_keeps_what_was_measured_and_set(operator: Operat
     assert session.decision("rig") == {**RIG, "settle_ms": 37.0} and session.decision("exposure")["exposure_ms"] == 2.0
     assert operator.choose_rig({**RIG, "settle_ms": 5.0})  # said by whoever chose it
     assert session.decision("rig")["settle_ms"] == 5.0 and session.decision("exposure")["exposure_ms"] == 2.0
-    assert operator.choose_rig({**RIG, "scale": 0.15})
+    assert operator.choose_rig({**RIG, "scale": 0.2})
     assert "settle_ms" not in session.decision("rig") and session.decision("exposure") is None
 
 
 def test_what_a_check_finds_belongs_to_the_rig_that_was_checked(operator: Operator) -> None:
     assert operator.check_rig()
     assert operator.wait_for(lambda s: s.rig.capture is not None and s.rig.capture.frame > 0, HANG_S)
-    other = {**RIG, "scale": 0.15}
+    other = {**RIG, "scale": 0.2}
     assert operator.choose_rig(other)
     assert operator.wait_for(lambda s: s.rig.state == "open" and s.rig.choice == other, HANG_S)
     after = operator.wait_until_idle()

@@ -9,7 +9,7 @@ from slviewer.wizard.timing import Timing
 
 HANG_S = 900.0
 """Ends a test that hangs; nothing that works takes as long on the slowest machine."""
-SPARING = Timing(retry_s=0.1, previews_per_s=2.0, trials=20)
+SPARING = Timing(retry_s=0.1, previews_per_s=1.0, trials=20)
 """Nobody looks at the previews, and the best of fewer poses does."""
 
 
