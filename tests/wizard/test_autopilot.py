@@ -192,6 +192,7 @@ def test_work_given_up_inside_a_long_call_saves_nothing(
         assert store.state_of("poses/pose_05") == "absent"
 
 
+@pytest.mark.slow
 def test_files_for_other_programs(operator: Operator) -> None:
     assert operator.export("mesh", "scan_01", "stl") and operator.export("mesh", "scan_01", "glb")
     assert operator.export("cloud", "scan_02") and operator.export("calibration") and operator.export("table")
