@@ -2,7 +2,7 @@
 
 Between captures it grabs previews and offers the latest one. A capture is saved by the request's own `save` before
 anything else happens, or it never existed. A fault ends the capture in which it happens, with a notice; the devices are
-then closed and opened again, every `RETRY_S` until they answer, and the preview goes on. Other work that needs the open
+then closed and opened again, every `retry_s` until they answer, and the preview goes on. Other work that needs the open
 devices, such as a check of the rig, is queued among the captures, and ends and fails as they do. A stream replaces the
 previews until anything else is requested.
 """
@@ -69,13 +69,21 @@ class Acquisition:
     """Owns the devices and the queue of requests. Every method may be called from any thread, and returns at once.
 
     `offer(frame, full_scale)` gets every preview (h, w), a fresh array each, and what the camera states as its full
-    scale; it must return at once too.
+    scale; it must return at once too. `clock()` returns the time in s.
     """
 
     def __init__(
-        self, notices: Notices, changed: Callable[[], None], offer: Callable[[np.ndarray, int | None], None]
+        self,
+        notices: Notices,
+        changed: Callable[[], None],
+        offer: Callable[[np.ndarray, int | None], None],
+        *,
+        retry_s: float = RETRY_S,
+        previews_per_s: float = PREVIEWS_PER_S,
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._notices, self._changed, self._offer = notices, changed, offer
+        self._retry_s, self._preview_s, self._clock = retry_s, 1 / previews_per_s, clock
         self._condition = threading.Condition()
         self._requests: deque[CaptureRequest | _Task] = deque()
         self._wanted: Rig | None = None
@@ -255,12 +263,12 @@ class Acquisition:
                     self._serve_request(rig, request)
                     next_preview = 0.0
                 elif not self._is_open:
-                    if time.monotonic() >= self._next_try:
+                    if self._clock() >= self._next_try:
                         self._open_devices(rig)
                 elif stream is not None:
                     self._serve_stream(rig, stream)
-                elif time.monotonic() >= next_preview:
-                    next_preview = time.monotonic() + 1 / PREVIEWS_PER_S
+                elif self._clock() >= next_preview:
+                    next_preview = self._clock() + self._preview_s
                     self._grab_preview(rig)
             except Exception as error:
                 self._handle_fault(error)
@@ -275,13 +283,13 @@ class Acquisition:
             if self._is_open and self._stream is not None:
                 return
             until = next_preview if self._is_open else self._next_try
-            pause = RETRY_S if self._rig is None else until - time.monotonic()
+            pause = self._retry_s if self._rig is None else until - self._clock()
             if pause > 0:
-                self._condition.wait(min(pause, RETRY_S))
+                self._condition.wait(min(pause, self._retry_s))
 
     def _open_devices(self, rig: Rig) -> None:
         """Open the rig's devices and grab a first preview; report a lost rig that answers again."""
-        self._next_try = time.monotonic() + RETRY_S
+        self._next_try = self._clock() + self._retry_s
         rig.open()
         self._is_open, self._applied, self._shown = True, None, None
         self._grab_preview(rig)  # devices that open and then do not answer are not ready
@@ -342,8 +350,8 @@ class Acquisition:
             self._notices.add("error", str(error))
             self.stop_stream()
             return
-        if white is not None and time.monotonic() >= self._next_preview:
-            self._next_preview = time.monotonic() + 1 / STREAM_PREVIEWS_PER_S
+        if white is not None and self._clock() >= self._next_preview:
+            self._next_preview = self._clock() + 1 / STREAM_PREVIEWS_PER_S
             self._offer(white, stated_full_scale(rig.camera))
 
     def _serve_request(self, rig: Rig, request: CaptureRequest | _Task) -> None:

@@ -24,11 +24,14 @@ TARGET = "circles:21x16:9"
 PLANE, SPHERE = "plane_04", "sphere_3"
 """Of the preset's plan, inside the calibrated depths."""
 PATIENCE_S = 120.0
-"""For one act."""
+"""Time limit of one act."""
 
 
 class Autopilot:
-    """Runs the whole wizard once. The snapshot names the current act; `before(act)` is called at the start of each."""
+    """Runs the whole wizard once. The snapshot names the current act; `before(act)` is called at the start of each.
+
+    ``patience_s``: the time limit of one act. ``pause_s``: the pause before each.
+    """
 
     def __init__(
         self,
@@ -36,9 +39,10 @@ class Autopilot:
         *,
         poses: int = 10,
         pause_s: float = 0.0,
+        patience_s: float = PATIENCE_S,
         before: Callable[[str], None] = lambda act: None,
     ) -> None:
-        self._operator, self._before = operator, before
+        self._operator, self._before, self._patience_s = operator, before, patience_s
         self._poses, self._pause_s = poses, pause_s
         self._stopped = threading.Event()
         self._thread = threading.Thread(target=self._run_and_report, name="slviewer autopilot", daemon=True)
@@ -84,7 +88,7 @@ class Autopilot:
         operator = self._operator
         if not self._wait_until_settled().rig.simulated:
             self._perform_act("Choosing the simulated rig", lambda: operator.choose_rig(RIG))
-        if operator.wait_for(lambda s: s.rig.state == "open", PATIENCE_S) is None:
+        if operator.wait_for(lambda s: s.rig.state == "open", self._patience_s) is None:
             raise SlviewerError("the simulated rig does not open")
         session = self._wait_until_settled().session
         if session is None:
@@ -162,7 +166,7 @@ class Autopilot:
 
     def _wait_until_settled(self) -> Snapshot:
         """Wait until no work runs; returns the snapshot. Raises Cancelled when stopped, SlviewerError on timeout."""
-        end = time.monotonic() + PATIENCE_S
+        end = time.monotonic() + self._patience_s
         while True:
             if self._stopped.is_set():
                 raise Cancelled("autopilot was stopped")

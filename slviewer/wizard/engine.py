@@ -35,6 +35,7 @@ from slviewer.wizard.jobs import Jobs, Reporter
 from slviewer.wizard.live_scan import LiveCloud, LiveScan
 from slviewer.wizard.notices import Notices, describe_error
 from slviewer.wizard.planner import Planner
+from slviewer.wizard.pose_plan import plan
 from slviewer.wizard.preview_watcher import HandsFree, Watch, Watcher
 from slviewer.wizard.publisher import Listeners, Publisher
 from slviewer.wizard.result_views import thumbnail
@@ -50,6 +51,7 @@ from slviewer.wizard.snapshot import (
     WorldView,
 )
 from slviewer.wizard.steps import Facts, views
+from slviewer.wizard.timing import Timing
 
 READ_ATTEMPTS = 20
 """Snapshots in a row that may meet the session's files in the middle of a change."""
@@ -58,7 +60,7 @@ READ_ATTEMPTS = 20
 class Engine:
     """Everything behind the requests. `capture_now` is called, on the preview's thread, for a hands-free capture."""
 
-    def __init__(self, set_up: SetUp, capture_now: Callable[[], object]) -> None:
+    def __init__(self, set_up: SetUp, capture_now: Callable[[], object], timing: Timing) -> None:
         self._set_up, self._capture_now = set_up, capture_now
         self.lock = threading.RLock()
         self.log = LogKeeper()
@@ -66,7 +68,7 @@ class Engine:
         self.preview_listeners = Listeners[PreviewView]()
         self.live: LiveScan | None = None  # the last one, whether it runs or not
         self.live_listeners = Listeners[LiveCloud]()
-        self.hands_free = HandsFree()
+        self.hands_free = HandsFree(timing.hold_s, timing.count_s)
         self.bench: RigSetup | None = None
         self.preflight: Preflight | None = None  # of the rig in use
         self.exposure_change: ExposureChange | None = None  # of the rig in use
@@ -83,12 +85,19 @@ class Engine:
         self._reached: tuple[Path | None, bool] = (None, False)  # a session, and whether its poses were enough
         self._failed_reads, self._reported_faults = 0, set[str]()
         empty = Snapshot(0, None, RigView(), None, None, (), views(Facts(None, RigView(), None)), None, False, "")
-        self.publisher = Publisher(self._build_snapshot, empty)
+        self.publisher = Publisher(self._build_snapshot, empty, timing.retry_s)
         self.notices = Notices(self.publisher.mark_changed)
         self.jobs = Jobs(self.notices, self.publisher.mark_changed)
-        self._planner = Planner(lambda: self.publisher.mark_changed(session=True))
+        compute = partial(plan, trials=timing.trials)
+        self._planner = Planner(lambda: self.publisher.mark_changed(session=True), compute)
         self.watcher = Watcher(self._handle_preview)
-        self.acquisition = Acquisition(self.notices, self.publisher.mark_changed, self.watcher.offer)
+        self.acquisition = Acquisition(
+            self.notices,
+            self.publisher.mark_changed,
+            self.watcher.offer,
+            retry_s=timing.retry_s,
+            previews_per_s=timing.previews_per_s,
+        )
         self.publisher.listeners.add(self._follow_up)
         self.publisher.start()
 

@@ -21,6 +21,7 @@ from slviewer.wizard.requests import request
 from slviewer.wizard.rig_requests import RigRequests
 from slviewer.wizard.snapshot import Level, Notice, PreviewView, Snapshot
 from slviewer.wizard.surfaces import Surfaces
+from slviewer.wizard.timing import Timing
 from slviewer.wizard.turn_requests import TurnRequests
 
 
@@ -41,9 +42,16 @@ class AutopilotLike(Protocol):
 class Operator(RigRequests, LiveRequests, TurnRequests, MeasureRequests, EditRequests, ImportRequests):
     """The wizard: requests in, snapshots out. Close it, or use it in a `with` block."""
 
-    def __init__(self, session: Path | str | None = None, rig: Choice | None = None, *, set_up: SetUp = set_up) -> None:
+    def __init__(
+        self,
+        session: Path | str | None = None,
+        rig: Choice | None = None,
+        *,
+        set_up: SetUp = set_up,
+        timing: Timing | None = None,
+    ) -> None:
         """Open or create `session`, with `rig`, by default the one that the session remembers."""
-        self._engine = Engine(set_up, self.capture_pose)
+        self._engine = Engine(set_up, self.capture_pose, timing or Timing())
         self._autopilot: AutopilotLike | None = None
         self._surfaces = Surfaces()
         if session is not None:

@@ -119,8 +119,11 @@ class PosePlan:
         return self.sigma_mm is not None and self.sigma_mm <= wanted_mm and len(self.poses) >= MIN_POSES
 
 
-def plan(given: PlanInput) -> PosePlan:
-    """Plan the next pose by information gain. The rig is the calibrated one, else one estimated from the poses."""
+def plan(given: PlanInput, trials: int | None = None) -> PosePlan:
+    """Plan the next pose by information gain, from ``trials`` candidates (None: as many as `suggest_poses` takes).
+
+    The rig is the calibrated one, else one estimated from the poses.
+    """
     poses = list(given.features.values())
     if given.calibrated is not None:
         rig, known = given.calibrated.rig, given.calibrated.poses
@@ -135,7 +138,7 @@ def plan(given: PlanInput) -> PosePlan:
     spread = _plan_by_coverage(given, rig.camera, known, suggests=False)
     expected = ExpectedNoise().with_noise(np.array([f.noise_px for f in poses]) / given.projector[0])
     try:
-        guidance = suggest_poses(GuidanceModel(rig, given.board, expected), list(spread.poses.values()))
+        guidance = suggest_poses(GuidanceModel(rig, given.board, expected), list(spread.poses.values()), trials)
     except (InputError, np.linalg.LinAlgError):  # devices that share no view: better coverage may repair it
         guidance = None
     if guidance is None:

@@ -10,7 +10,7 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numba
@@ -33,10 +33,11 @@ class Preparation:
     """The process that compiles.
 
     ``report`` is called, on a thread of its own, with the share of its work that is done, and with None at the end.
+    ``command``: the process, which prints these shares.
     """
 
-    def __init__(self, report: Callable[[float | None], None]) -> None:
-        self._report = report
+    def __init__(self, report: Callable[[float | None], None], command: Sequence[str] = COMMAND) -> None:
+        self._report, self._command = report, command
         self._process: subprocess.Popen[str] | None = None
         self._thread = threading.Thread(target=self._run, name="slviewer preparation", daemon=True)
 
@@ -58,7 +59,7 @@ class Preparation:
         pipe = subprocess.PIPE
         try:
             self._process = subprocess.Popen(
-                COMMAND, stdin=pipe, stdout=pipe, stderr=subprocess.DEVNULL, text=True, env=environment
+                self._command, stdin=pipe, stdout=pipe, stderr=subprocess.DEVNULL, text=True, env=environment
             )
         except OSError as error:  # kernels are then compiled when they are first used
             log.warning("kernels cannot be compiled beforehand: %s", error)

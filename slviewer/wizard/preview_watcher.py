@@ -34,6 +34,8 @@ _UNCHANGED = (
     6.0  # 99 % of a thumbnail's grey levels differ by less where nothing moved: a board's edges, by a fifth of a px
 )
 _THUMBNAIL_PX = 160
+HOLD_S = 1.0  # for which a board is held still before a hands-free countdown starts
+COUNT_S = 1.0  # of the countdown
 _REST = 2.0  # pause after a detection, as a multiple of its duration: a third of one core at most
 
 
@@ -220,12 +222,10 @@ def observe_board(
 
 
 class HandsFree:
-    """Decides when to capture hands-free: once the board was held still for a while in a new place."""
+    """Decides when to capture hands-free: ``count_s`` after the board was held still for ``hold_s`` in a new place."""
 
-    HOLD_S = 1.0
-    COUNT_S = 1.0
-
-    def __init__(self) -> None:
+    def __init__(self, hold_s: float = HOLD_S, count_s: float = COUNT_S) -> None:
+        self._hold_s, self._count_s = hold_s, count_s
         self.is_on = False
         self._captured: np.ndarray | None = None  # the board's outline at the last capture
         self._requested: float | None = None  # when the last capture was, until the board is detected after it
@@ -240,12 +240,12 @@ class HandsFree:
         if self._requested is not None and not busy and board is not None and board.time_s > self._requested:
             self._captured, self._requested = board.outline, None
         held = self.is_on and self._requested is None and board is not None and not busy
-        if not held or board is None or board.still_s < self.HOLD_S or self._is_captured(board.outline):
+        if not held or board is None or board.still_s < self._hold_s or self._is_captured(board.outline):
             self._begun = None
             return None
         if self._begun is None:
             self._begun = now
-        return self.COUNT_S - (now - self._begun)
+        return self._count_s - (now - self._begun)
 
     def note_capture(self) -> None:
         """Note that a capture was requested; the board's outline in the next preview is then the captured place."""

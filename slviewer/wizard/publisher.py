@@ -50,13 +50,13 @@ class Publisher:
     """Builds a snapshot when something has changed, and publishes it to every listener.
 
     Where that fails, the last snapshot is published again with the reason as its `read_failure`, and another is built
-    every `RETRY_S` seconds until one succeeds.
+    every ``retry_s`` until one succeeds.
 
     `build(version, session_changed)` and the listeners are called on the publisher's thread alone.
     """
 
-    def __init__(self, build: Callable[[int, bool], Snapshot], first: Snapshot) -> None:
-        self._build = build
+    def __init__(self, build: Callable[[int, bool], Snapshot], first: Snapshot, retry_s: float = RETRY_S) -> None:
+        self._build, self._retry_s = build, retry_s
         self._condition = threading.Condition()
         self._requested = self._published = 0  # changes: counted, and those that listeners know
         self._session_changed = self._urgent = self._closing = False
@@ -114,7 +114,7 @@ class Publisher:
             with self._condition:
                 self._condition.wait_for(
                     lambda: self._requested > self._published or self._closing,
-                    RETRY_S if self.latest.read_failure else None,
+                    self._retry_s if self.latest.read_failure else None,
                 )
                 if self._closing:
                     return

@@ -1,21 +1,24 @@
-"""The whole wizard, flown once on a small rig; then everything that can be looked at, exported and undone."""
+"""The autopilot runs the wizard on a small rig; then everything that can be looked at, exported and undone."""
 
 import importlib
+import shutil
 import zipfile
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
+from facts import missing_facts, raises
 from scipy.spatial import cKDTree
+from wizard_events import HANG_S, SPARING, list_texts
 
-from slviewer.calibration.guidance import pose_selection
 from slviewer.calibration.splined import fields
 from slviewer.errors import Cancelled
 from slviewer.session.ply import read_ply
 from slviewer.session.store import Session
-from slviewer.wizard import acquisition, result_views, tasks
+from slviewer.wizard import result_views, tasks
 from slviewer.wizard.autopilot import TARGET, Autopilot
 from slviewer.wizard.jobs import Reporter
 from slviewer.wizard.operator import Operator
@@ -24,6 +27,17 @@ from slviewer.wizard.snapshot import SessionView, Snapshot
 pytestmark = pytest.mark.computes
 
 RIG = {"driver": "simulated", "scale": 0.25, "seed": 0}
+POSES = 8
+
+
+@contextmanager
+def flown(folder: Path, patterns: str, acts: list[str]) -> Iterator[Operator]:
+    """An operator of the session in this folder, in which the autopilot has done its acts."""
+    with pytest.MonkeyPatch.context() as patch, Operator(folder, RIG, timing=SPARING) as operator:
+        patch.setattr(fields, "CELLS_ACROSS", 12)  # a hundredth of the time to solve, and as good for this rig
+        operator.choose_patterns(patterns)
+        Autopilot(operator, poses=POSES, patience_s=HANG_S, before=acts.append).run()
+        yield operator
 
 
 @pytest.fixture(scope="module")
@@ -32,13 +46,15 @@ def acts() -> list[str]:
 
 
 @pytest.fixture(scope="module")
-def operator(tmp_path_factory: pytest.TempPathFactory, acts: list[str]) -> Iterator[Operator]:
+def operator(recorded: Path, tmp_path_factory: pytest.TempPathFactory, acts: list[str]) -> Iterator[Operator]:
+    """After all acts of the autopilot, which found all poses but the last in its session."""
     folder = tmp_path_factory.mktemp("flight") / "session"
-    with pytest.MonkeyPatch.context() as patch, Operator(folder, RIG) as operator:
-        patch.setattr(fields, "CELLS_ACROSS", 12)  # a hundredth of the time to solve, and as good for this rig
-        patch.setattr(pose_selection, "TRIALS", 20)  # the best of fewer poses does
-        patch.setattr(acquisition, "PREVIEWS_PER_S", 2.0)  # nobody looks
-        Autopilot(operator, poses=8, before=acts.append).run()
+    with Session.create(folder):
+        pass
+    for pose in (f"pose_{i:02d}" for i in range(1, POSES)):
+        for place in (f"captures/{pose}", *(f"results/{made}/{pose}" for made in ("poses", "evidence", "trust"))):
+            shutil.copytree(recorded / "session" / place, folder / place)
+    with flown(folder, "p18", acts) as operator:
         yield operator
 
 
@@ -47,11 +63,24 @@ def session_of(snapshot: Snapshot) -> SessionView:
     return snapshot.session
 
 
-def test_the_flight_reaches_a_merged_ply(operator: Operator, acts: list[str]) -> None:
-    snapshot = operator.snapshot()
+def test_the_flight_from_recorded_poses_reaches_a_merged_ply(operator: Operator, acts: list[str]) -> None:
+    assert_all_is_measured(operator.snapshot(), acts)
+    assert "Capturing pose 7 of 8" not in acts
+
+
+@pytest.mark.slow
+def test_the_flight_reaches_a_merged_ply(tmp_path: Path) -> None:
+    acts: list[str] = []
+    with flown(tmp_path / "session", "complementary", acts) as operator:
+        assert_all_is_measured(operator.snapshot(), acts)
+    assert "Capturing pose 1 of 8" in acts
+
+
+def assert_all_is_measured(snapshot: Snapshot, acts: list[str]) -> None:
+    """Assert that the autopilot has calibrated, verified, scanned, merged and measured."""
     session = session_of(snapshot)
     assert [step.state for step in snapshot.steps] == ["done"] * 9
-    assert not [notice.text for notice in snapshot.notices if notice.level == "error"]
+    assert list_texts(snapshot, "error") == []
     assert "Capturing pose 8 of 8" in acts and acts[-1] == "Writing the report"
     assert {pose.state for pose in session.poses} == {"used"}
     assert all(pose.rms_px and 0.01 < max(pose.rms_px) < 0.4 for pose in session.poses)
@@ -83,14 +112,14 @@ def test_the_flight_reaches_a_merged_ply(operator: Operator, acts: list[str]) ->
 
 def test_poses_are_asked_for_until_the_wanted_sigma_is_reached(operator: Operator) -> None:
     assert operator.set_wanted_sigma(0.0001) and operator.set_hands_free(True)
-    snapshot = operator.wait_until_idle()
+    snapshot = operator.wait_until_idle(HANG_S)
     session = session_of(snapshot)
     plan = session.plan
     assert plan is not None and session.wanted_mm == 0.0001 and not session.enough
     assert plan.sigma_next_mm is not None and plan.sigma_mm is not None and plan.sigma_next_mm < plan.sigma_mm
     assert snapshot.hands_free
     assert operator.set_wanted_sigma(None) and not operator.set_wanted_sigma(-1.0)
-    snapshot = operator.wait_until_idle()
+    snapshot = operator.wait_until_idle(HANG_S)
     assert session_of(snapshot).enough and not snapshot.hands_free
     assert snapshot.step("poses").state == "done"
 
@@ -114,11 +143,25 @@ def test_panels_find_what_they_draw(operator: Operator) -> None:
 @pytest.mark.parametrize(
     ("where", "make"),
     [
-        ("calibrate.calibrate_pixelwise", lambda store, r: tasks.calibrate_session(store, TARGET, r, print)),
-        ("poses.observe", lambda store, r: tasks.calibrate_session(store, TARGET, r, print)),
+        pytest.param(
+            "calibrate.calibrate_pixelwise",
+            lambda store, r: tasks.calibrate_session(store, TARGET, r, print),
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            "poses.observe", lambda store, r: tasks.calibrate_session(store, TARGET, r, print), marks=pytest.mark.slow
+        ),
         ("capture_clouds.reconstruct", lambda store, r: tasks.reconstruct_capture(store, "scan_01", None, r, print)),
-        ("merge.fuse", lambda store, r: tasks.merge_scans(store, ["scan_01"], "scan_02", r, print)),
-        ("verify.compare", lambda store, r: tasks.verify_captures(store, ["plane_01"], "plane", None, r, print)),
+        pytest.param(
+            "merge.fuse",
+            lambda store, r: tasks.merge_scans(store, ["scan_01"], "scan_02", r, print),
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            "verify.compare",
+            lambda store, r: tasks.verify_captures(store, ["plane_01"], "plane", None, r, print),
+            marks=pytest.mark.slow,
+        ),
     ],
 )
 def test_work_given_up_inside_a_long_call_saves_nothing(
@@ -142,18 +185,19 @@ def test_work_given_up_inside_a_long_call_saves_nothing(
         return {str(p): p.stat().st_mtime_ns for folder in kept for p in folder.rglob("*") if p.is_file()}
 
     before = files()
-    with pytest.raises(Cancelled):
+    with raises(Cancelled):
         make(store, report)
     assert files() == before
     if where == "poses.observe":
         assert store.state_of("poses/pose_05") == "absent"
 
 
+@pytest.mark.slow
 def test_files_for_other_programs(operator: Operator) -> None:
     assert operator.export("mesh", "scan_01", "stl") and operator.export("mesh", "scan_01", "glb")
     assert operator.export("cloud", "scan_02") and operator.export("calibration") and operator.export("table")
     assert operator.export("merged-mesh") and operator.diagnostic_bundle()
-    session = session_of(operator.wait_until_idle())
+    session = session_of(operator.wait_until_idle(HANG_S))
     files = {export.name: export for export in session.exports}
     assert all(export.bytes > 100 for export in files.values())
     assert len(trimesh.load(files["scan_01_mesh.stl"].path).faces) > 10_000
@@ -169,7 +213,7 @@ def test_files_for_other_programs(operator: Operator) -> None:
         names = inside.namelist()
         assert {"versions.json", "state.json", "log.txt", "session/decisions.json"} <= set(names)
         assert "previews/pose_01.jpg" in names and not [n for n in names if "frames" in n or n.endswith(".npy")]
-        assert b"calibrated from 8 poses" in inside.read("log.txt")
+        assert missing_facts(inside.read("log.txt").decode(), "8 poses") == []
     assert bundle.bytes < 1_000_000
     assert not operator.export("mesh", "scan_01", "doc") and not operator.export("cloud", "../x")
     assert not [path for path in (operator.session.folder / "exports").iterdir() if path.name.startswith(".")]  # type: ignore[union-attr]
@@ -180,6 +224,7 @@ def read_head(path: Path) -> str:
         return file.read(1000).decode("ascii", "replace")
 
 
+@pytest.mark.slow
 def test_a_scale_that_was_applied_is_in_the_clouds_and_makes_older_ones_stale(operator: Operator) -> None:
     store = operator.session
     assert store is not None
@@ -187,13 +232,14 @@ def test_a_scale_that_was_applied_is_in_the_clouds_and_makes_older_ones_stale(op
     inputs = store.input_hashes("calibration/splined")
     store.save_result("scale/splined", {"factor": 1.001, "certificate": "lab 7", "inputs": inputs}, {})
     assert operator.choose_model("splined")
-    session = session_of(operator.wait_until_idle())
+    session = session_of(operator.wait_until_idle(HANG_S))
     assert session.calibration is not None and session.calibration.chosen == "splined"
-    assert session.calibration.scales == {"splined": "scale corrected by +1000 ppm, by certificate lab 7"}
+    assert set(session.calibration.scales) == {"splined"}
+    assert missing_facts(session.calibration.scales["splined"], "+1000 ppm", "lab 7") == []
     assert {scan.cloud for scan in session.scans} == {"stale"} and all(view.stale for view in session.verifications)
     assert operator.reconstruct("scan_02")
-    scan = operator.wait_until_idle().scan("scan_02")
-    assert scan is not None and scan.cloud == "fresh" and scan.scale.startswith("scale corrected by +1000 ppm")
+    scan = operator.wait_until_idle(HANG_S).scan("scan_02")
+    assert scan is not None and scan.cloud == "fresh" and missing_facts(scan.scale, "+1000 ppm", "lab 7") == []
     after = result_views.scan_cloud(store, "scan_02").points
     both = np.isfinite(before[..., 2]) & np.isfinite(after[..., 2])
     np.testing.assert_allclose(after[both], before[both] * np.float32(1.001), rtol=1e-6)
@@ -201,13 +247,14 @@ def test_a_scale_that_was_applied_is_in_the_clouds_and_makes_older_ones_stale(op
     assert operator.choose_model("") and not operator.choose_model("anchored")
 
 
+@pytest.mark.slow
 def test_what_changes_makes_stale_what_came_from_it(operator: Operator) -> None:
     assert operator.exclude("pose_02")
-    stale = operator.wait_until_idle()
-    assert session_of(stale).calibration.stale.startswith("pose_02 was excluded")  # type: ignore[union-attr]
+    stale = operator.wait_until_idle(HANG_S)
+    assert missing_facts(session_of(stale).calibration.stale, "pose_02", "excluded") == []  # type: ignore[union-attr]
     assert stale.step("calibrate").state == "ready" and stale.step("scan").state == "done"
     assert operator.calibrate()
-    again = operator.wait_until_idle()
+    again = operator.wait_until_idle(HANG_S)
     session = session_of(again)
     assert (
         session.calibration is not None
@@ -215,15 +262,15 @@ def test_what_changes_makes_stale_what_came_from_it(operator: Operator) -> None:
         and len(session.calibration.stereo.poses) == 7
     )
     assert session.calibration.models == ("stereo", "pixelwise")  # what was made of other poses is gone
-    assert any("it needs 8 target poses" in notice.text for notice in again.notices)
+    assert any(not missing_facts(notice.text, "splined", 8, 7) for notice in again.notices)
     assert {scan.cloud for scan in session.scans} == {"stale"} and all(view.stale for view in session.verifications)
     assert session.merge is not None and session.merge.stale and again.step("merge").state == "ready"
     assert again.pose("pose_02").state == "excluded"  # type: ignore[union-attr]
     assert operator.reconstruct("scan_01")
-    assert again.scan("scan_01") is not None and operator.wait_until_idle().scan("scan_01").cloud == "fresh"  # type: ignore[union-attr]
+    assert again.scan("scan_01") is not None and operator.wait_until_idle(HANG_S).scan("scan_01").cloud == "fresh"  # type: ignore[union-attr]
     assert operator.undo_merge()
-    undone = session_of(operator.wait_until_idle())
+    undone = session_of(operator.wait_until_idle(HANG_S))
     assert undone.merge is None and "merged_1.ply" not in {export.name for export in undone.exports}
     assert not operator.undo_merge()
     assert operator.delete("scan_02")
-    assert operator.wait_until_idle().scan("scan_02") is None
+    assert operator.wait_until_idle(HANG_S).scan("scan_02") is None

@@ -8,12 +8,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from facts import missing_facts
+from wizard_events import HANG_S, list_texts
 
 from slviewer.fringe.patterns import render
 from slviewer.fringe.presets import gray
 from slviewer.pipeline.import_calibration import import_opencv_calibration
 from slviewer.session.exporters import write_calibration
 from slviewer.wizard.operator import Operator
+from slviewer.wizard.snapshot import Level
 
 PROJECTOR = (120, 90)
 
@@ -48,65 +51,70 @@ def archived(source: Path) -> bytes:
     return data.getvalue()
 
 
-def texts(operator: Operator, level: str) -> list[str]:
-    return [notice.text for notice in operator.snapshot().notices if notice.level == level]
+def reports(operator: Operator, level: Level, *facts: object) -> bool:
+    """Whether a notice of this level states these facts."""
+    return any(not missing_facts(text, *facts) for text in list_texts(operator.snapshot(), level))
 
 
+@pytest.mark.computes
 def test_a_folder_becomes_poses_and_what_is_skipped_is_said(operator: Operator, source: Path) -> None:
     assert operator.import_folder(f" {source} ", projector="120x90")
-    view = operator.wait_until_idle(60).session
+    view = operator.wait_until_idle(HANG_S).session
     assert view is not None and [pose.name for pose in view.poses] == ["capture_0", "capture_2"]
-    assert any("2 captures imported as target poses: capture_0, capture_2" in text for text in texts(operator, "good"))
-    assert any("capture_1" in text and "graycode_05" in text for text in texts(operator, "warning"))
+    assert reports(operator, "good", 2, "poses", "capture_0", "capture_2")
+    assert reports(operator, "warning", "capture_1", "graycode_05")
 
 
+@pytest.mark.computes
 def test_a_zip_becomes_scans_and_leaves_nothing_behind(operator: Operator, source: Path) -> None:
     assert operator.import_zip("my scans.zip", archived(source), role="scan", projector="120x90")
-    view = operator.wait_until_idle(60).session
+    view = operator.wait_until_idle(HANG_S).session
     assert view is not None and [scan.name for scan in view.scans] == ["capture_0", "capture_2"]
-    assert any("notes.txt" in text for text in texts(operator, "warning"))
-    assert any("2 captures imported as scans" in text for text in texts(operator, "good"))
+    assert reports(operator, "warning", "notes.txt")
+    assert reports(operator, "good", 2, "scans", "capture_0", "capture_2")
     assert operator.session is not None
     assert operator.session.load_capture("capture_0").meta["source"] == "my scans.zip"
     assert not [path for path in operator.session.folder.iterdir() if "import" in path.name]
     assert operator.import_zip("one.zip", archived(source / "capture_0"), role="scan", projector="120x90")
-    operator.wait_until_idle(60)
-    assert any("capture_0" in text and "already" in text for text in texts(operator, "warning"))
+    operator.wait_until_idle(HANG_S)
+    assert reports(operator, "warning", "capture_0", "already")
     assert operator.import_zip("one.zip", archived(source / "capture_0"), projector="120x90")  # as poses
-    operator.wait_until_idle(60)
-    assert any("capture_0" in text and "already" in text for text in texts(operator, "error"))
+    operator.wait_until_idle(HANG_S)
+    assert reports(operator, "error", "capture_0", "already")
 
 
 def test_what_cannot_be_imported_is_said_in_words(operator: Operator, source: Path, tmp_path: Path) -> None:
     assert not operator.import_folder("  ")
-    for path, fact in ((tmp_path / "absent", "absent"), (tmp_path, "none of the known layouts")):
+    for path, facts in ((tmp_path / "absent", [tmp_path / "absent"]), (tmp_path, [tmp_path, "layouts"])):
         assert operator.import_folder(path)
-        operator.wait_until_idle(60)
-        assert any(fact in text for text in texts(operator, "error")), fact
+        operator.wait_until_idle(HANG_S)
+        assert reports(operator, "error", *facts), facts
     assert operator.import_zip("a.zip", b"no zip")
-    operator.wait_until_idle(60)
-    assert any("no zip" in text for text in texts(operator, "error"))
+    operator.wait_until_idle(HANG_S)
+    assert reports(operator, "error", "zip")
     assert operator.import_folder(source, projector="wide")
-    operator.wait_until_idle(60)
-    assert any("'wide'" in text for text in texts(operator, "error"))
+    operator.wait_until_idle(HANG_S)
+    assert reports(operator, "error", "wide")
     assert operator.session is not None and operator.session.capture_names() == []
 
 
 def test_a_cancelled_import_saves_nothing(operator: Operator, source: Path) -> None:
     assert operator.import_folder(source, projector="120x90")
     operator.cancel()
-    operator.wait_until_idle(60)
+    operator.wait_until_idle(HANG_S)
     assert operator.session is not None and operator.session.capture_names() == []
 
 
+@pytest.mark.process
+@pytest.mark.computes
 def test_an_imported_calibration_without_sizes_waits_for_captures(source: Path, tmp_path: Path) -> None:
     K, R = np.array([[400.0, 0, 60], [0, 400.0, 45], [0, 0, 1]]), np.eye(3)
     matrices = {"K_camera": K, "D_camera": np.zeros(5), "K_projector": K, "D_projector": np.zeros(5)}
     write_calibration(tmp_path / "rig.yml", {**matrices, "R": R, "T": np.array([100.0, 0, 0])})
     import_opencv_calibration(tmp_path / "rig.yml", tmp_path / "session")
     with Operator(tmp_path / "session") as operator:
-        view = operator.wait_until_idle(60).session
+        view = operator.wait_until_idle(HANG_S).session
         assert view is not None and view.calibration is None
         assert operator.import_folder(source, projector="120x90")
-        view = operator.wait_until_idle(60).session
+        view = operator.wait_until_idle(HANG_S).session
         assert view is not None and view.calibration is not None and view.calibration.stereo.baseline_mm == 100

@@ -3,14 +3,15 @@
 import os
 import platform
 import threading
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from facts import missing_facts
+from wizard_events import HANG_S, until
 
 from slviewer.errors import CalibrationRejected, Cancelled
-from slviewer.wizard.jobs import Jobs, release_memory
+from slviewer.wizard.jobs import Jobs, Reporter, release_memory
 from slviewer.wizard.notices import Notices
 
 
@@ -26,20 +27,23 @@ def jobs(notices: Notices) -> Iterator[Jobs]:
     jobs.close()
 
 
-def texts(notices: Notices) -> list[str]:
-    return [notice.text for notice in notices.all()]
+def the_only(notices: Notices, level: str) -> str:
+    """Return the text of the only notice, which has this level."""
+    (notice,) = notices.all()
+    assert notice.level == level
+    return notice.text
 
 
 def test_jobs_run_in_order_and_the_operators_before_the_background(jobs: Jobs) -> None:
     order: list[str] = []
     gate = threading.Event()
-    jobs.submit("first", lambda report: gate.wait(5))
+    jobs.submit("first", lambda report: gate.wait(HANG_S))
     for name in ("b1", "b2"):
         jobs.submit(name, lambda report, name=name: order.append(name), background=True)
     for name in ("f1", "f2"):
         jobs.submit(name, lambda report, name=name: name, lambda result: order.append(result))
     gate.set()
-    assert jobs.wait_until_idle(5)
+    assert jobs.wait_until_idle(HANG_S)
     assert order == ["f1", "f2", "b1", "b2"] and jobs.view() is None
 
 
@@ -49,44 +53,44 @@ def test_progress_is_seen(jobs: Jobs) -> None:
     def work(report):
         report(0.5, "halfway")
         half.set()
-        go_on.wait(5)
+        go_on.wait(HANG_S)
 
     jobs.submit("Working", work)
     jobs.submit("Next", lambda report: None)
-    assert half.wait(5)
+    assert half.wait(HANG_S)
     view = jobs.view()
     assert view is not None
     assert (view.name, view.share, view.stage, view.can_cancel, view.waiting) == ("Working", 0.5, "halfway", True, 1)
     go_on.set()
-    assert jobs.wait_until_idle(5)
+    assert jobs.wait_until_idle(HANG_S)
 
 
 def test_cooperative_work_stops_at_its_next_report(jobs: Jobs, notices: Notices) -> None:
-    started, stopped, done = threading.Event(), threading.Event(), []
+    started, stopped, pause, done = threading.Event(), threading.Event(), threading.Event(), []
 
     def work(report):
         started.set()
         try:
             while True:
                 report(0.1, "on and on")
-                time.sleep(0.01)
+                pause.wait(0.01)
         except Cancelled:
             stopped.set()
             raise
 
     jobs.submit("Counting", work, done.append)
-    assert started.wait(5)
+    assert started.wait(HANG_S)
     jobs.cancel()
-    assert jobs.wait_until_idle(1) and stopped.is_set() and done == []
-    assert texts(notices) == ["Counting: cancelled"]
+    assert jobs.wait_until_idle(HANG_S) and stopped.is_set() and done == []
+    assert missing_facts(the_only(notices, "info"), "Counting", "cancelled") == []
 
 
-def test_what_cannot_be_interrupted_is_abandoned_within_a_second_and_never_saves(jobs: Jobs, notices: Notices) -> None:
-    started, woke, saved, done = threading.Event(), threading.Event(), [], []
+def test_what_cannot_be_interrupted_is_abandoned_and_never_saves(jobs: Jobs, notices: Notices) -> None:
+    started, wake, woke, saved, done = threading.Event(), threading.Event(), threading.Event(), [], []
 
     def sleeping(report):
         started.set()
-        time.sleep(5)  # as a call into OpenCV does
+        assert wake.wait(HANG_S)  # as a call into OpenCV does
         try:
             report.saving()
             saved.append(True)
@@ -95,43 +99,57 @@ def test_what_cannot_be_interrupted_is_abandoned_within_a_second_and_never_saves
 
     jobs.submit("Sleeping", sleeping, done.append)
     jobs.submit("Next", lambda report: "next", done.append)
-    assert started.wait(5)
-    begun = time.monotonic()
+    assert started.wait(HANG_S)
     jobs.cancel()
-    assert jobs.wait_until_idle(4)
-    assert time.monotonic() - begun < 4 and done == ["next"]
-    assert woke.wait(20) and saved == [] and texts(notices) == ["Sleeping: cancelled"]
+    assert jobs.wait_until_idle(HANG_S)
+    assert not woke.is_set() and done == ["next"], "the next job did not wait for it"
+    wake.set()
+    assert woke.wait(HANG_S) and saved == []
+    assert missing_facts(the_only(notices, "info"), "Sleeping", "cancelled") == []
 
 
-def test_a_save_that_has_begun_is_awaited_and_counts(jobs: Jobs, notices: Notices) -> None:
+def test_a_save_that_has_begun_is_awaited_and_counts(
+    jobs: Jobs, notices: Notices, monkeypatch: pytest.MonkeyPatch
+) -> None:
     saving, done = threading.Event(), []
+    polls = threading.Semaphore(0)
+
+    def has_saved(reporter: Reporter) -> bool:
+        polls.release()
+        return reporter._saving
+
+    monkeypatch.setattr(Reporter, "has_saved", property(has_saved))
 
     def work(report):
         report(0.9, "saving")
         report.saving()
         saving.set()
-        time.sleep(0.8)
+        for _ in range(3):  # it was cancelled, and the worker waits
+            assert polls.acquire(timeout=HANG_S)
         report.saving()  # the second of two files
         report(1.0, "saved")
         return "saved"
 
     jobs.submit("Saving", work, done.append)
-    assert saving.wait(5)
+    assert saving.wait(HANG_S)
     jobs.cancel()
-    assert jobs.wait_until_idle(5) and done == ["saved"] and texts(notices) == []
+    assert jobs.wait_until_idle(HANG_S) and done == ["saved"] and notices.all() == ()
 
 
 @pytest.mark.parametrize(
-    ("error", "says"),
+    ("error", "facts"),
     [
-        (CalibrationRejected("2 usable poses, and at least 3 are needed"), "2 usable poses, and at least 3 are needed"),
-        (KeyError("x"), "Failing failed because of an error in the program (KeyError); see the log for details"),
-        (MemoryError(), "out of memory"),
-        (OSError(28, "No space left on device", "/x"), "Failing failed: No space left on device (/x)"),
+        (
+            CalibrationRejected("2 usable poses, and at least 3 are needed"),
+            ["2 usable poses, and at least 3 are needed"],
+        ),
+        (KeyError("x"), ["Failing", "KeyError", "log"]),
+        (MemoryError(), ["Failing", "memory"]),
+        (OSError(28, "No space left on device", "/x"), ["Failing", "No space left on device", "/x"]),
     ],
 )
 def test_a_failure_becomes_a_notice_and_later_jobs_go_on(
-    jobs: Jobs, notices: Notices, caplog: pytest.LogCaptureFixture, error: Exception, says: str
+    jobs: Jobs, notices: Notices, caplog: pytest.LogCaptureFixture, error: Exception, facts: list[str]
 ) -> None:
     def work(report):
         raise error
@@ -140,21 +158,29 @@ def test_a_failure_becomes_a_notice_and_later_jobs_go_on(
     jobs.submit("Failing", work)
     jobs.submit("Failing when done", lambda report: None, lambda result: 1 / 0)
     jobs.submit("Next", lambda report: 1, done.append)
-    assert jobs.wait_until_idle(5) and done == [1]
+    assert jobs.wait_until_idle(HANG_S) and done == [1]
     first, second = notices.all()
-    assert first.level == "error" and says in first.text and "Failing when done" in second.text
+    assert first.level == "error" and missing_facts(first.text, *facts) == []
+    assert missing_facts(second.text, "Failing when done") == []
     assert ("Traceback" in caplog.text) and (("KeyError: 'x'" in caplog.text) == isinstance(error, KeyError))
 
 
 def test_closing_ends_everything(notices: Notices) -> None:
     jobs = Jobs(notices, lambda: None)
-    jobs.submit("Sleeping", lambda report: time.sleep(15))
-    time.sleep(0.05)
-    begun = time.monotonic()
+    started, wake, woke = threading.Event(), threading.Event(), threading.Event()
+
+    def sleep(report):
+        started.set()
+        assert wake.wait(HANG_S)
+        woke.set()
+
+    jobs.submit("Sleeping", sleep)
+    assert started.wait(HANG_S)
     jobs.close()
-    assert time.monotonic() - begun < 10
     jobs.submit("Too late", lambda report: None)
-    assert not any(thread.name == "slviewer worker" and thread.is_alive() for thread in threading.enumerate())
+    until(lambda: not any(thread.name == "slviewer worker" and thread.is_alive() for thread in threading.enumerate()))
+    assert not woke.is_set(), "closing did not wait for it"
+    wake.set()
 
 
 def read_memory_mb() -> float:

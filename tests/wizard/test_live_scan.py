@@ -1,14 +1,15 @@
 """Scanning live on a small simulated rig: clouds as a capture gives them, the newest first, and an end in any case."""
 
 import threading
-import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
+from facts import missing_facts
 from faulty_rig import FaultyRigs
+from wizard_events import HANG_S, SPARING, until, wait_until_open
 
 from slviewer.calibration.pixelwise import PixelFit, PixelwiseModel
 from slviewer.devices.protocols import CameraSettings
@@ -21,10 +22,11 @@ from slviewer.pipeline.models import load_stereo
 from slviewer.pipeline.simulate import save_true_stereo
 from slviewer.session.store import Session
 from slviewer.simulation.rig import letter
-from slviewer.wizard import acquisition, live_scan
+from slviewer.wizard import live_scan
 from slviewer.wizard.live_frames import Stream
 from slviewer.wizard.live_scan import LiveCloud, LiveModel
 from slviewer.wizard.operator import Operator
+from slviewer.wizard.snapshot import Level
 
 pytestmark = pytest.mark.computes
 
@@ -42,9 +44,9 @@ class Wizard:
             save_true_stereo(store, rig)
         self.rigs = FaultyRigs()
         self.clouds: list[LiveCloud] = []
-        self.operator = Operator(folder, RIG, set_up=self.rigs)
+        self.operator = Operator(folder, RIG, set_up=self.rigs, timing=SPARING)
         self.operator.subscribe_live(self.clouds.append)
-        assert self.operator.wait_for(lambda s: s.rig.state == "open", 60)
+        wait_until_open(self.operator)
         self.operator.place("object")
 
     def goes_on(self, more: int = 3) -> None:
@@ -52,22 +54,18 @@ class Wizard:
         until(lambda: len(self.clouds) >= seen + more)
 
     def ends(self) -> None:
-        assert self.operator.wait_for(lambda s: s.live is None, 60)
+        assert self.operator.wait_for(lambda s: s.live is None, HANG_S)
 
-    def told(self, words: str) -> bool:
-        return self.operator.wait_for(lambda s: any(words in notice.text for notice in s.notices), 60) is not None
-
-
-def until(condition: Callable[[], bool], timeout_s: float = 60.0) -> None:
-    end = time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < end, "it took too long"
-        time.sleep(0.005)
+    def reports(self, level: Level, *facts: object) -> bool:
+        """Whether a notice of this level comes, or has come, that states these facts."""
+        shown = self.operator.wait_for(
+            lambda s: any(n.level == level and not missing_facts(n.text, *facts) for n in s.notices), HANG_S
+        )
+        return shown is not None
 
 
 @pytest.fixture
-def wizard(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Wizard]:
-    monkeypatch.setattr(acquisition, "RETRY_S", 0.1)
+def wizard(tmp_path: Path) -> Iterator[Wizard]:
     wizard = Wizard(tmp_path / "session")
     yield wizard
     wizard.operator.close()
@@ -84,12 +82,12 @@ def test_slow_clouds_have_a_rate_too() -> None:
 
 def test_clouds_stream_are_kept_and_give_way_to_a_capture(wizard: Wizard) -> None:
     operator = wizard.operator
-    assert not operator.save_live() and wizard.told("no live scan runs")
+    assert not operator.save_live() and wizard.reports("error", "live")
     assert operator.start_live()
     wizard.goes_on()
     for cloud in wizard.clouds:
         operator.count_live_shown(cloud)
-    live = operator.wait_for(lambda s: s.live is not None and s.live.shown_per_s > 0, 60)
+    live = operator.wait_for(lambda s: s.live is not None and s.live.shown_per_s > 0, HANG_S)
     assert live is not None and live.live is not None
     assert live.live.points > 3000 and live.live.clouds_per_s > 0
     assert live.live.latency_ms is not None and live.live.latency_ms > 1
@@ -119,6 +117,7 @@ def test_clouds_stream_are_kept_and_give_way_to_a_capture(wizard: Wizard) -> Non
     assert [(s.label, s.cloud) for s in after.session.scans] == [("a <b>face</b>", "fresh"), ("scan_02", "fresh")]
 
 
+@pytest.mark.slow
 def test_stopping_frees_the_devices_and_starting_again_goes_on(wizard: Wizard) -> None:
     operator = wizard.operator
     for _ in range(2):
@@ -140,10 +139,10 @@ def test_a_fault_ends_it_with_a_sentence_and_what_was_kept_stays(wizard: Wizard)
     wizard.goes_on()
     assert operator.save_live()
     wizard.rigs.faults.plan("unplugged", 4)
-    assert wizard.told("the camera does not answer")
+    assert wizard.reports("error", "the camera does not answer")
     wizard.ends()
-    assert wizard.told("the rig answers again")
-    assert operator.wait_for(lambda s: s.rig.state == "open", 60)
+    assert wizard.reports("good", "the rig")
+    wait_until_open(operator)
     assert operator.session is not None and operator.session.capture_names() == ["scan_01"]
     assert operator.start_live()
     wizard.goes_on(1)

@@ -5,6 +5,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from wizard_events import HANG_S
 
 from slviewer.wizard import preparation
 from slviewer.wizard.preparation import Preparation, prepared_file
@@ -22,37 +23,38 @@ def done(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return file
 
 
-def prepare(status: int, monkeypatch: pytest.MonkeyPatch) -> list[float | None]:
+def prepare(status: int) -> list[float | None]:
     """What is reported by a process that ends with this status."""
-    monkeypatch.setattr(preparation, "COMMAND", [sys.executable, "-c", SCRIPT.format(status=status)])
     reports: list[float | None] = []
-    preparation_process = Preparation(reports.append)
+    preparation_process = Preparation(reports.append, [sys.executable, "-c", SCRIPT.format(status=status)])
     preparation_process.start()
-    preparation_process._thread.join(30)
+    preparation_process._thread.join(HANG_S)
     return reports
 
 
-def test_progress_is_reported_and_the_next_start_compiles_nothing(done: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert prepare(0, monkeypatch) == [0.0, 0.5, None]
+@pytest.mark.process
+def test_progress_is_reported_and_the_next_start_compiles_nothing(done: Path) -> None:
+    assert prepare(0) == [0.0, 0.5, None]
     assert done.exists()
-    assert prepare(0, monkeypatch) == []
+    assert prepare(0) == []
 
 
-def test_what_failed_is_tried_again_at_the_next_start(done: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert prepare(1, monkeypatch) == [0.0, 0.5, None]
+@pytest.mark.process
+def test_what_failed_is_tried_again_at_the_next_start(done: Path) -> None:
+    assert prepare(1) == [0.0, 0.5, None]
     assert not done.exists()
 
 
 def test_an_environment_variable_switches_it_off(done: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(preparation.SWITCHED_OFF, "1")
-    assert prepare(0, monkeypatch) == []
+    assert prepare(0) == []
     assert not done.exists()
 
 
-@pytest.mark.computes
+@pytest.mark.process
 def test_the_process_ends_with_the_program_that_started_it() -> None:
     process = subprocess.Popen(preparation.COMMAND, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     assert process.stdin is not None and process.stdout is not None
     assert float(process.stdout.readline()) == 0.0  # it works
     process.stdin.close()
-    assert process.wait(10) == 1
+    assert process.wait(HANG_S) == 1

@@ -2,10 +2,10 @@
 
 import math
 import threading
-import time
 
 import numpy as np
 import pytest
+from wizard_events import HANG_S, until
 
 from slviewer.calibration.next_pose import nominal_lens
 from slviewer.fringe.sequence import Frame, PatternSequence
@@ -25,6 +25,7 @@ def seen(still_s: float, shift: float = 0.0, time_s: float = math.inf) -> BoardS
     return BoardSeen(outline, outline, still_s, None, time_s)
 
 
+@pytest.mark.computes
 def test_the_board_is_found_in_the_cameras_pixels() -> None:
     rig = letter(0.6, local_distortion_px=0)
     middle = (BOARD.points.min(0) + BOARD.points.max(0)) / 2
@@ -42,10 +43,12 @@ def test_the_board_is_found_in_the_cameras_pixels() -> None:
 
     watcher = Watcher(see)
     watcher.watch(Watch(BOARD, nominal_lens(rig.camera.size, 3555.6 * 0.6)))
-    for _ in range(400):
+
+    def offer_again() -> bool:
         watcher.offer(frame)
-        if arrived.wait(0.05):
-            break
+        return arrived.wait(0.05)
+
+    until(offer_again)
     watcher.close()
     board = found[0].board
     assert board is not None
@@ -56,6 +59,7 @@ def test_the_board_is_found_in_the_cameras_pixels() -> None:
     assert found[0].image.shape[1] == 800 and 0.7 < found[0].brightest < 0.95 and found[0].saturated == 0
 
 
+@pytest.mark.computes
 def test_an_image_is_searched_again_only_once_something_has_moved(monkeypatch: pytest.MonkeyPatch) -> None:
     searched: list[np.ndarray] = []
 
@@ -86,17 +90,15 @@ def test_only_the_latest_frame_is_looked_at() -> None:
     def slow(view: PreviewView) -> None:
         views.append(view)
         begun.set()
-        go_on.wait(5)
+        go_on.wait(HANG_S)
 
     watcher = Watcher(slow)
     watcher.offer(np.zeros((60, 80), np.uint8))
-    assert begun.wait(5)
+    assert begun.wait(HANG_S)
     for level in range(1, 100):
         watcher.offer(np.full((60, 80), level, np.uint8))
     go_on.set()
-    end = time.monotonic() + 5
-    while len(views) < 2 and time.monotonic() < end:
-        time.sleep(0.01)
+    until(lambda: len(views) >= 2)
     watcher.close()
     assert [view.image[0, 0] for view in views] == [0, 99]
 

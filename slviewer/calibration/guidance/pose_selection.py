@@ -21,7 +21,7 @@ DIRECTIONS = tuple((x, y) for x, y in product((-1.0, 0.0, 1.0), repeat=2))
 """Directions from the image's centre in which the farthest visible pose is a candidate; (0, 0): the most central."""
 _OFFSETS = 15  # positions along each side of the image that are tested for visibility
 TRIALS = 56
-"""Number of randomly drawn candidates whose gain is computed; a fifth as many more near the best of them."""
+"""Default number of randomly drawn candidates whose gain is computed; a fifth as many more near the best of them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,8 +37,12 @@ class Guidance:
     sigma_next_mm: float
 
 
-def suggest_poses(model: GuidanceModel, poses: Sequence[Floats]) -> Guidance | None:
-    """Recommend the next poses after ``poses``, T_camera_board (4, 4) mm each; None where no pose is visible."""
+def suggest_poses(model: GuidanceModel, poses: Sequence[Floats], trials: int | None = None) -> Guidance | None:
+    """Recommend the next poses after ``poses``, T_camera_board (4, 4) mm each; None where no pose is visible.
+
+    ``trials``: number of drawn candidates, `TRIALS` by default.
+    """
+    trials = TRIALS if trials is None else trials
     candidates = list_candidate_poses(model)
     if not len(candidates):
         return None
@@ -53,9 +57,9 @@ def suggest_poses(model: GuidanceModel, poses: Sequence[Floats]) -> Guidance | N
             for i, rows in zip(indices, information_rows(model, candidates[indices]), strict=True)
         }
 
-    gains = compute_gains(np.random.default_rng(len(poses)).permutation(len(candidates))[:TRIALS].tolist())
+    gains = compute_gains(np.random.default_rng(len(poses)).permutation(len(candidates))[:trials].tolist())
     best = max(gains, key=lambda i: gains[i])
-    nearest = np.argsort(_pose_distances(candidates[best], candidates))[: TRIALS // 5]
+    nearest = np.argsort(_pose_distances(candidates[best], candidates))[: trials // 5]
     gains |= compute_gains([i for i in nearest.tolist() if i not in gains])
     order = sorted(gains, key=lambda i: -gains[i])
     next_variance = max(float(information.variances.mean()) - gains[order[0]], 0.0)
