@@ -5,7 +5,7 @@ import re
 from pathlib import Path
 
 from playwright.sync_api import Browser, Locator, Page, expect
-from wizard_page import SIZE, Opened, click
+from wizard_page import Opened, click, new_page
 
 from slviewer import wizard
 from slviewer.calibration.diagnosis.verdict import CAUSES, Finding, Verdict
@@ -75,7 +75,7 @@ def test_findings_checks_and_refusals_link_to_their_sections() -> None:
     assert hrefs(merge_failure_html("no", {})) == hrefs(help_link("merge"))
 
 
-def test_help_opens_beside_the_wizard(opened: Opened, app: App, operator: Operator, browser: Browser) -> None:
+def test_help_opens_in_another_tab(opened: Opened, app: App, operator: Operator, browser: Browser) -> None:
     page = opened.page
 
     def follow(link: Locator, heading: str) -> Page:
@@ -107,7 +107,7 @@ def test_help_opens_beside_the_wizard(opened: Opened, app: App, operator: Operat
     finding = page.locator("a[href$='#moved']")
     follow(finding, "Moved").close()
 
-    viewer = browser.new_context(viewport=SIZE).new_page()
+    viewer = new_page(browser)
     viewer.goto(app.server.link("watch"))
     viewer.locator("a[href$='#moved']").wait_for()
     with viewer.context.expect_page() as shown:
@@ -115,7 +115,7 @@ def test_help_opens_beside_the_wizard(opened: Opened, app: App, operator: Operat
     expect(shown.value.locator(":target")).to_have_text("Moved")
     viewer.context.close()
 
-    stranger = browser.new_context().new_page()
+    stranger = new_page(browser)
     answer = stranger.goto(address)
     assert answer is not None and answer.status == 403 and "xposure" not in stranger.content()
     stranger.context.close()
