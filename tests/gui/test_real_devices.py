@@ -11,13 +11,12 @@ import numpy as np
 import pytest
 from facts import missing_facts
 from playwright.sync_api import Browser, Page, expect
-from wizard_page import PATIENCE_S, Opened, choose, click, field, new_page
+from wizard_page import PATIENCE_S, Opened, choose, click, new_page
 
 from slviewer.devices.browser import PageChannels
 from slviewer.fringe.decode import decode
 from slviewer.gui.app import App
 from slviewer.pipeline.rig_choice import set_up
-from slviewer.pipeline.rig_presets import save_rig
 from slviewer.server.secure import Serving
 from slviewer.session.store import Session
 from slviewer.wizard.operator import Operator
@@ -105,18 +104,3 @@ def coordinates(folder: Path) -> None:
         assert np.mean(np.abs(off) < 0.5) >= 0.999  # NaN counts as wrong
         assert 0.0005 < np.sqrt(np.nanmean(off**2)) < 0.1 and abs(np.nanmean(off)) < 0.02
     assert capture.texture is not None and capture.texture.shape == (*SCREEN[::-1], 3)
-
-
-def test_refused_rig_leaves_the_one_in_use(opened: Opened, operator: Operator, tmp_path: Path) -> None:
-    page = opened.page
-    assert operator.session is not None
-    camera = {"driver": "opencv", "source": str(tmp_path / "no.avi")}
-    save_rig(operator.session, "gone", {"camera": camera, "projector": {"driver": "browser", "size": [640, 480]}})
-    assert operator.set_hands_free(False)  # anything that has the session read anew
-    click(page, "1. Rig")
-    for _ in range(2):  # it can be tried again
-        choose(page, "Rig", "gone")
-        expect(page.get_by_text("no.avi does not exist").first).to_be_visible()
-        expect(field(page, "Rig")).to_have_value("Simulated, quarter size")
-    assert sum("does not exist" in notice.text for notice in operator.snapshot().notices) == 2
-    assert operator.snapshot().rig.state == "open"

@@ -1,4 +1,4 @@
-"""The frame of the page, as someone sees it who opens it: the step, a guest, the links, a failure."""
+"""The frame of the page, as someone sees it who opens it: the step, a guest, the links, the help, a failure."""
 
 import webbrowser
 from collections.abc import Iterator
@@ -7,11 +7,14 @@ from pathlib import Path
 import pytest
 import zstandard
 from facts import raises
-from playwright.sync_api import Browser, expect
+from playwright.sync_api import Browser, Locator, Page, expect
 from wizard_page import PATIENCE_S, RIG, Opened, button, choose, click, field, new_page, wait_until
 
+from slviewer.calibration.diagnosis.verdict import Finding, Verdict
 from slviewer.errors import UsageError
 from slviewer.gui.app import App, browser_opened, rig_choice
+from slviewer.pipeline.calibration_verdict import save_verdict
+from slviewer.pipeline.rig_presets import save_rig
 from slviewer.server.secure import Serving
 from slviewer.wizard.operator import Operator
 
@@ -82,6 +85,21 @@ def test_new_links_invalidate_old_ones(opened: Opened, app: App, browser: Browse
     guest.context.close()
 
 
+def test_refused_rig_leaves_the_one_in_use(opened: Opened, app: App, tmp_path: Path) -> None:
+    page, operator = opened.page, app.operator
+    assert operator.session is not None
+    camera = {"driver": "opencv", "source": str(tmp_path / "no.avi")}
+    save_rig(operator.session, "gone", {"camera": camera, "projector": {"driver": "browser", "size": [640, 480]}})
+    assert operator.set_hands_free(False)  # anything that has the session read anew
+    click(page, "1. Rig")
+    for _ in range(2):  # it can be tried again
+        choose(page, "Rig", "gone")
+        expect(page.get_by_text("no.avi does not exist").first).to_be_visible()
+        expect(field(page, "Rig")).to_have_value("Simulated, quarter size")
+    assert sum("does not exist" in notice.text for notice in operator.snapshot().notices) == 2
+    assert operator.snapshot().rig.state == "open"
+
+
 def test_camera_password_is_sent_to_operators_only(
     opened: Opened, app: App, browser: Browser, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -140,6 +158,53 @@ def test_invalid_session_folder_is_reported(opened: Opened, tmp_path: Path) -> N
     opened.enter("Folder", str(tmp_path / "a file"))
     click(page, "Open session")
     expect(page.get_by_role("alert").filter(has_text="Error").filter(has_text="a file").first).to_be_visible()
+    assert opened.errors == []
+
+
+def test_help_opens_in_another_tab(opened: Opened, app: App, browser: Browser) -> None:
+    page, operator = opened.page, app.operator
+
+    def follow(link: Locator, heading: str) -> Page:
+        """Click a link, and return the tab with the heading that it opens."""
+        with page.context.expect_page() as shown:
+            link.click()
+        expect(shown.value.locator(":target")).to_have_text(heading)
+        assert shown.value.evaluate("window.opener") is None
+        return shown.value
+
+    step_help = page.get_by_role("link", name="Help").first
+    click(page, "1. Rig")
+    expect(step_help).to_have_attribute("href", "help/howto/wizard.md#rig")
+    follow(step_help, "Rig").close()
+    click(page, "2. Target")
+    expect(step_help).to_have_attribute("href", "help/howto/wizard.md#target")
+    tab = follow(step_help, "Target")
+
+    tab.get_by_role("link", name="Warnings and findings").first.click()
+    expect(tab.get_by_role("heading", level=1)).to_have_text("Warnings and findings")
+    tab.get_by_role("link", name="exposures").first.click()
+    expect(tab.get_by_role("heading", level=1)).to_have_text("Choosing exposures")
+    address = tab.url
+    tab.close()
+
+    save_verdict(operator.session, Verdict.of([Finding("moved", "rejected", "pose_03 moved", "hold it still")]), ())
+    operator.choose_target("circles:21x16:9")
+    click(page, "4. Calibrate")
+    finding = page.locator("a[href$='#moved']")
+    follow(finding, "Moved").close()
+
+    viewer = new_page(browser)
+    viewer.goto(app.server.link("watch"))
+    viewer.locator("a[href$='#moved']").wait_for()
+    with viewer.context.expect_page() as shown:
+        viewer.locator("a[href$='#moved']").click()
+    expect(shown.value.locator(":target")).to_have_text("Moved")
+    viewer.context.close()
+
+    stranger = new_page(browser)
+    answer = stranger.goto(address)
+    assert answer is not None and answer.status == 403 and "xposure" not in stranger.content()
+    stranger.context.close()
     assert opened.errors == []
 
 
