@@ -6,6 +6,7 @@ from functools import partial
 import cv2
 import msgspec
 import numpy as np
+import pytest
 from playwright.sync_api import Browser, expect
 from wizard_page import PATIENCE_S, choose, click, new_page
 
@@ -61,6 +62,7 @@ def test_qr_code_decodes_to_its_link() -> None:
     assert (picture[:4] == 255).all() and (picture[:, -4:] == 255).all(), "the quiet zone"
 
 
+@pytest.mark.slow
 def test_operator_sees_state_of_camera_page(browser: Browser) -> None:
     pages = PageChannels()
     with Operator(set_up=partial(set_up, pages=pages)) as operator:

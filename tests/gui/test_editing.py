@@ -234,6 +234,7 @@ def test_points_of_two_scans_are_deleted_and_restored_in_step_merge(
     assert opened.errors == []
 
 
+@pytest.mark.slow
 def test_region_is_set_by_numbers_and_by_handle(wizard: tuple[Opened, App, Operator, Views]) -> None:
     opened, app, operator, _ = wizard
     page = opened.page

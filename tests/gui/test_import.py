@@ -39,6 +39,7 @@ def zip_of_captures() -> bytes:
     return data.getvalue()
 
 
+@pytest.mark.slow
 def test_uploaded_zip_becomes_poses_and_its_faults_are_listed(opened: Opened, operator: Operator) -> None:
     page = opened.page
     click(page, "3. Poses")

@@ -32,6 +32,7 @@ def app(tmp_path: Path) -> Iterator[App]:
         wizard.close()
 
 
+@pytest.mark.slow
 @pytest.mark.computes
 def test_live_clouds_are_shown_saved_and_stopped(browser: Browser, app: App) -> None:
     page = new_page(browser)

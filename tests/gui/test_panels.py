@@ -123,6 +123,7 @@ def test_models_are_compared_on_request_and_comparison_can_be_cancelled(
     assert errors == []
 
 
+@pytest.mark.slow
 def test_plane_and_sphere_are_measured_and_exported(measured: tuple[Page, Operator, list[str]]) -> None:
     page, _, errors = measured
     click(page, "5. Verify")

@@ -46,43 +46,24 @@ def opened(shared_page: Opened) -> Opened:
     return shared_page
 
 
-def watch(browser: Browser, app: App) -> Opened:
-    """A guest's page, ready."""
+@pytest.fixture(scope="module")
+def shared_guest(browser: Browser, app: App) -> Iterator[Opened]:
     page = new_page(browser)
-    opened = Opened(page)
+    found = Opened(page)
     page.goto(app.server.link("watch"))
     expect(page.get_by_text("View only")).to_be_visible()
-    return opened
+    yield found
+    page.context.close()
 
 
-def test_guest_sees_same_step_and_changes_nothing(opened: Opened, app: App, browser: Browser) -> None:
-    watching = watch(browser, app)
-    guest = watching.page
+def test_guest_sees_same_step_and_changes_nothing(opened: Opened, shared_guest: Opened, app: App) -> None:
+    guest = shared_guest.page
     click(opened.page, "2. Target")
     expect(button(guest, "Use this board")).to_be_visible()
-    watching.send(lambda: click(guest, "1. Rig"), "GuiUpdateMessage")
+    shared_guest.send(lambda: click(guest, "1. Rig"), "GuiUpdateMessage")
     click(opened.page, "Use this board")  # what the operator requests after that is all that happens
     expect(guest.get_by_text("In use: circles:21x16:9")).to_be_visible()
     assert app.shell.current == "target"
-    guest.context.close()
-
-
-def test_new_links_invalidate_old_ones(opened: Opened, app: App, browser: Browser) -> None:
-    page, old = opened.page, app.server.link("watch")
-    guest = watch(browser, app).page
-    click(page, "Links")
-    expect(page.get_by_text(old)).to_be_visible()
-    assert old not in guest.content()
-    before = page.url
-    click(page, "New links")
-    page.wait_for_url(lambda url: "/operate-" in url and url != before)
-    expect(button(page, "1. Rig")).to_be_visible()
-    assert app.server.link("watch") != old
-    guest.reload()
-    expect(guest.get_by_text("no longer valid")).to_be_visible()
-    guest.goto(old)
-    expect(guest.get_by_text("no longer, valid")).to_be_visible()
-    guest.context.close()
 
 
 def test_refused_rig_leaves_the_one_in_use(opened: Opened, app: App, tmp_path: Path) -> None:
@@ -101,13 +82,12 @@ def test_refused_rig_leaves_the_one_in_use(opened: Opened, app: App, tmp_path: P
 
 
 def test_camera_password_is_sent_to_operators_only(
-    opened: Opened, app: App, browser: Browser, caplog: pytest.LogCaptureFixture
+    opened: Opened, shared_guest: Opened, caplog: pytest.LogCaptureFixture
 ) -> None:
-    page = opened.page
+    page, guest = opened.page, shared_guest.page
     received: list[bytes | str] = []
-    guest = new_page(browser)
     guest.on("websocket", lambda socket: socket.on("framereceived", lambda frame: received.append(frame)))
-    guest.goto(app.server.link("watch"))
+    guest.reload()
     expect(guest.get_by_text("View only")).to_be_visible()
     click(page, "1. Rig")
     choose(page, "Rig", "Custom …")
@@ -121,7 +101,6 @@ def test_camera_password_is_sent_to_operators_only(
     shown = "".join(field(guest, "Camera ID").input_value() + guest.content())
     messages = "".join(unpacked(frame) for frame in received)
     assert "Camera ID" in messages and "hunter2" not in shown + caplog.text + messages
-    guest.context.close()
 
 
 def unpacked(frame: bytes | str) -> str:
@@ -161,8 +140,8 @@ def test_invalid_session_folder_is_reported(opened: Opened, tmp_path: Path) -> N
     assert opened.errors == []
 
 
-def test_help_opens_in_another_tab(opened: Opened, app: App, browser: Browser) -> None:
-    page, operator = opened.page, app.operator
+def test_help_opens_in_another_tab(opened: Opened, shared_guest: Opened, app: App, browser: Browser) -> None:
+    page, operator, viewer = opened.page, app.operator, shared_guest.page
 
     def follow(link: Locator, heading: str) -> Page:
         """Click a link, and return the tab with the heading that it opens."""
@@ -193,19 +172,35 @@ def test_help_opens_in_another_tab(opened: Opened, app: App, browser: Browser) -
     finding = page.locator("a[href$='#moved']")
     follow(finding, "Moved").close()
 
-    viewer = new_page(browser)
-    viewer.goto(app.server.link("watch"))
     viewer.locator("a[href$='#moved']").wait_for()
     with viewer.context.expect_page() as shown:
         viewer.locator("a[href$='#moved']").click()
     expect(shown.value.locator(":target")).to_have_text("Moved")
-    viewer.context.close()
 
     stranger = new_page(browser)
     answer = stranger.goto(address)
     assert answer is not None and answer.status == 403 and "xposure" not in stranger.content()
     stranger.context.close()
     assert opened.errors == []
+
+
+@pytest.mark.slow
+def test_new_links_invalidate_old_ones(opened: Opened, shared_guest: Opened, app: App) -> None:
+    page, old = opened.page, app.server.link("watch")
+    guest = shared_guest.page
+    expect(guest.get_by_text("View only")).to_be_visible()
+    click(page, "Links")
+    expect(page.get_by_text(old)).to_be_visible()
+    assert old not in guest.content()
+    before = page.url
+    click(page, "New links")
+    page.wait_for_url(lambda url: "/operate-" in url and url != before)
+    expect(button(page, "1. Rig")).to_be_visible()
+    assert app.server.link("watch") != old
+    guest.reload()
+    expect(guest.get_by_text("no longer valid")).to_be_visible()
+    guest.goto(old)
+    expect(guest.get_by_text("no longer, valid")).to_be_visible()
 
 
 @pytest.mark.parametrize("text", ["simulated:half", "simulated:1,5"])
