@@ -8,6 +8,7 @@ import numpy as np
 import viser
 
 from slviewer.errors import InputError
+from slviewer.evaluation.render import format_count
 from slviewer.gui.inputs import change
 from slviewer.gui.panel import PanelContext
 from slviewer.gui.widgets import Text, coloured, paragraph
@@ -193,6 +194,7 @@ class PointEditing:
         """Forget the corners of the outline."""
         self._corners, self._rays, self._view = [], [], None
         self._context.scene.remove(self._layer, _OUTLINE)
+        self._hint.write(_HINTS[self._mode.value], "dim")
         change(self._close, visible=False)
 
     def _draw_selection(self) -> None:
@@ -219,11 +221,10 @@ class PointEditing:
     # the 3D view
 
     def _change_mode(self) -> None:
-        """Take what the new way of selecting needs."""
+        """Take what the new way of selecting needs, then show its hint."""
+        self._listen()
         with self._lock:
             self._forget_outline()
-            self._hint.write(_HINTS[self._mode.value], "dim")
-        self._listen()
 
     def _listen(self) -> None:
         """Take the clicks or drags that the way of selecting needs."""
@@ -279,6 +280,8 @@ class PointEditing:
             ends = np.array(self._rays)
             segments = np.stack([ends, np.roll(ends, -1, axis=0)], axis=1)
             self._context.scene.lines(self._layer, _OUTLINE, segments, SELECTED)
+            count = format_count(len(self._corners), "corner")
+            self._hint.write(f"{_HINTS[LASSO]} {count} set.", "dim")
             change(self._close, visible=True, disabled=len(self._corners) < 3)
 
     def _close_outline(self) -> None:

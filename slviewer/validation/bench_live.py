@@ -89,10 +89,13 @@ class LiveFigures:
         )
 
 
-def live_rate(scale: float = 0.5, seconds: float = 30.0, progress: Progress = ignore_progress) -> LiveFigures:
+def live_rate(
+    scale: float = 0.5, seconds: float = 30.0, progress: Progress = ignore_progress, *, warm_s: float = _WARM_S
+) -> LiveFigures:
     """Scan the demo object live on the simulated rig, its camera 1600x1200 times `scale`, settled at once.
 
-    Clouds are reconstructed by the stereo model of the true lenses. Raises SlviewerError where live scanning fails.
+    Clouds are reconstructed by the stereo model of the true lenses; the figures begin `warm_s` after the first one.
+    Raises SlviewerError where live scanning fails.
     """
     progress(0.0, "preparing the rig")
     with tempfile.TemporaryDirectory() as folder:
@@ -105,12 +108,12 @@ def live_rate(scale: float = 0.5, seconds: float = 30.0, progress: Progress = ig
                 _wait_until(lambda: len(server.viser.get_clients()) == 1, operator)
                 operator.start_live()
                 _wait_until(lambda: _get_shown_rate(operator) > 0, operator)
-                return _measure(operator, server, seconds, progress)
+                return _measure(operator, server, seconds, progress, warm_s)
 
 
-def _measure(operator: Operator, server: SafeServer, seconds: float, progress: Progress) -> LiveFigures:
+def _measure(operator: Operator, server: SafeServer, seconds: float, progress: Progress, warm_s: float) -> LiveFigures:
     """Figures of the running live scan over so many seconds, with a second viewer that stops reading."""
-    time.sleep(_WARM_S)
+    time.sleep(warm_s)
     begun, first = time.monotonic(), operator.live_captures
     used: list[tuple[float, tuple[float, ...]]] = []
     made, shown, behind, points = [], [], [], 0

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 from playwright.sync_api import Browser, expect
-from wizard_page import SIZE, Opened, button
+from wizard_page import PATIENCE_MS, PATIENCE_S, RIG, Opened, button, new_page
 
 from slviewer.calibration.guidance import pose_selection
 from slviewer.gui.app import App
@@ -13,9 +13,7 @@ from slviewer.server.secure import Serving
 from slviewer.wizard import acquisition
 from slviewer.wizard.operator import Operator
 
-RIG = {"driver": "simulated", "scale": 0.25}
-
-expect.set_options(timeout=40_000)  # a browser that draws in software beside the wizard's own work has its pauses
+expect.set_options(timeout=PATIENCE_MS)
 
 
 @pytest.fixture(scope="module", autouse=True)  # not longer: others measure what is suggested
@@ -30,7 +28,7 @@ def calm() -> Iterator[None]:
 @pytest.fixture
 def operator(tmp_path: Path) -> Iterator[Operator]:
     with Operator(tmp_path / "session", RIG) as engine:
-        assert engine.wait_for(lambda s: s.rig.state == "open", 20.0) is not None
+        assert engine.wait_for(lambda s: s.rig.state == "open", PATIENCE_S) is not None
         yield engine
 
 
@@ -44,10 +42,9 @@ def app(operator: Operator) -> Iterator[App]:
 @pytest.fixture
 def opened(browser: Browser, app: App) -> Iterator[Opened]:
     """The operator's page, ready."""
-    page = browser.new_page(viewport=SIZE)
-    page.set_default_timeout(60_000)
+    page = new_page(browser)
     found = Opened(page)
     page.goto(app.server.link())
     button(page, "1. Rig").wait_for()
     yield found
-    page.close()
+    page.context.close()

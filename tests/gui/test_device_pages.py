@@ -6,8 +6,9 @@ from functools import partial
 import cv2
 import msgspec
 import numpy as np
+import pytest
 from playwright.sync_api import Browser, expect
-from wizard_page import choose, click
+from wizard_page import PATIENCE_S, choose, click, new_page
 
 from slviewer.devices.browser import PageChannels
 from slviewer.devices.browser_camera import Video
@@ -22,37 +23,37 @@ from slviewer.wizard.operator import Operator
 VIDEO = Video((1920, 1080), "", "Back camera", (), 10.0, True)
 
 
-def test_the_wizard_serves_the_projector_page(browser: Browser) -> None:
+def test_wizard_serves_projector_page(browser: Browser) -> None:
     channel = ProjectorChannel()
     with Operator() as operator:
         app = App(operator, Serving(port=0), pages=PageChannels(channel))
-        page = browser.new_page(viewport={"width": 320, "height": 240})
+        page = new_page(browser, {"width": 320, "height": 240})
         try:
             page.goto(app.server.link("project"))
-            assert channel.wait_ready(10.0).words == "ready 320 x 240"
+            assert channel.wait_ready(PATIENCE_S).words == "ready 320 x 240"
             projector = browser_projector(page=channel)
             projector.open()
             projector.load(gray((320, 240)))
             projector.show(0)
             projector.close()
         finally:
-            page.close()
+            page.context.close()
             app.close()
 
 
-def test_a_wizard_without_a_channel_has_no_such_page(browser: Browser) -> None:
+def test_wizard_without_page_channel_has_no_projector_page(browser: Browser) -> None:
     with Operator() as operator:
         app = App(operator, Serving(port=0))
-        page = browser.new_page()
+        page = new_page(browser)
         try:
             page.goto(app.server.link("project"))
             expect(page.get_by_text("There is no such page here")).to_be_visible()
         finally:
-            page.close()
+            page.context.close()
             app.close()
 
 
-def test_a_link_is_read_back_from_its_qr_code() -> None:
+def test_qr_code_decodes_to_its_link() -> None:
     link = "https://192.168.1.20:8080/#oCRs5MUmmGxbcJl_PG-zfGJufRe80kDD"
     png = base64.b64decode(encode_qr_code(link).partition(",")[2])
     picture = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_GRAYSCALE)
@@ -61,11 +62,12 @@ def test_a_link_is_read_back_from_its_qr_code() -> None:
     assert (picture[:4] == 255).all() and (picture[:, -4:] == 255).all(), "the quiet zone"
 
 
-def test_the_operator_sees_what_the_camera_page_needs(browser: Browser) -> None:
+@pytest.mark.slow
+def test_operator_sees_state_of_camera_page(browser: Browser) -> None:
     pages = PageChannels()
     with Operator(set_up=partial(set_up, pages=pages)) as operator:
         app = App(operator, Serving(port=0), pages=pages)
-        page = browser.new_page()
+        page = new_page(browser)
         try:
             page.goto(app.server.link())
             click(page, "1. Rig")
@@ -78,5 +80,5 @@ def test_the_operator_sees_what_the_camera_page_needs(browser: Browser) -> None:
             click(page, "Use these devices")
             expect(page.get_by_text("the projector's size is unknown").first).to_be_visible()
         finally:
-            page.close()
+            page.context.close()
             app.close()

@@ -1,8 +1,7 @@
 """Region of interest and editing of points in the step Scan, as someone uses them in a browser."""
 
 import re
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +10,18 @@ import pytest
 import trimesh
 from playwright.sync_api import Browser, Page, expect
 from scipy.spatial import cKDTree
-from wizard_page import SIZE, Opened, button, choose, click, cut_labels, field
+from wizard_page import (
+    PATIENCE_S,
+    Opened,
+    button,
+    choose,
+    click,
+    cut_labels,
+    field,
+    new_page,
+    wait_until,
+    wait_until_still,
+)
 
 from slviewer.devices.simulated import simulated_rig
 from slviewer.devices.world import SimulatedWorld
@@ -28,7 +38,10 @@ from slviewer.validation.bench_live import true_calibration
 from slviewer.wizard.operator import Operator
 from slviewer.wizard.result_views import scan_cloud, whole_cloud
 
-PATIENCE_S = 150.0
+pytestmark = pytest.mark.computes
+
+CORNERS = ((-30, -30), (30, -30), (30, 30), (-30, 30))
+"""Of an outline around a place on the page, px."""
 
 
 def capture_scans(folder: Path, world: SimulatedWorld, angles_deg: dict[str, float], patterns: str = "gray") -> None:
@@ -38,35 +51,64 @@ def capture_scans(folder: Path, world: SimulatedWorld, angles_deg: dict[str, flo
         capture(folder, name, {}, role="scan", patterns=patterns, set_up=lambda *_: RigSetup(simulated_rig(world)))
 
 
-@pytest.fixture
-def wizard(tmp_path: Path, browser: Browser) -> Iterator[tuple[Opened, App, Operator]]:
-    """A page in the step Scan of a session with two scans, of which the first is reconstructed, without a rig."""
-    folder, rig = tmp_path / "session", letter(0.25)
+class Views:
+    """The views of a wizard's only browser, as it reported them."""
+
+    def __init__(self, app: App) -> None:
+        self._app = app
+        self._positions: list[np.ndarray] = []
+        app.server.viser.on_client_connect(
+            lambda client: client.camera.on_update(lambda camera: self._positions.append(np.array(camera.position)))
+        )
+
+    def wait_for(self, page: Page, points: np.ndarray) -> None:
+        """Wait until the browser's view has moved to points (..., 3) mm."""
+        (client,) = self._app.server.viser.get_clients().values()
+        low, high = np.nanpercentile(points.reshape(-1, 3), [2, 98], axis=0)
+
+        def has_moved() -> bool:
+            is_meant = np.linalg.norm(client.camera.look_at - (low + high) / 2) < 0.1 * np.linalg.norm(high - low)
+            reported = self._positions[-1] if self._positions else np.full(3, np.inf)
+            return bool(is_meant and np.allclose(reported, client.camera.position, atol=0.5))
+
+        wait_until(page, has_moved)
+
+
+@pytest.fixture(scope="module")
+def shared_wizard(
+    tmp_path_factory: pytest.TempPathFactory, browser: Browser
+) -> Iterator[tuple[Opened, App, Operator, Views]]:
+    """A page on a session with two scans, of which the first is reconstructed, without a rig."""
+    folder, rig = tmp_path_factory.mktemp("two_scans") / "session", letter(0.25)
     true_calibration(folder, rig)
     world = SimulatedWorld(rig)
     world.place("object")
     capture_scans(folder, world, {"one": 0.0, "two": 0.0})
     with Operator(folder) as operator:
         operator.reconstruct("one")
-        operator.wait_until_idle()
+        operator.wait_until_idle(PATIENCE_S)
         app = App(operator, Serving(port=0))
-        page = browser.new_page(viewport=SIZE)
-        page.set_default_timeout(60_000)
+        views = Views(app)
+        page = new_page(browser)
         opened = Opened(page)
         page.goto(app.server.link())
-        click(page, "6. Scan")
-        expect(page.get_by_text(re.compile("points shown; the file has all"))).to_be_visible(timeout=PATIENCE_S * 1000)
-        yield opened, app, operator
-        page.close()
+        yield opened, app, operator, views
+        page.context.close()
         app.close()
 
 
-def wait_until(page: Page, holds: Callable[[], bool]) -> None:
-    """Let the page work until something holds."""
-    end = time.monotonic() + PATIENCE_S
-    while not holds():
-        assert time.monotonic() < end, "it did not come about"
-        page.wait_for_timeout(100)
+@pytest.fixture
+def wizard(shared_wizard: tuple[Opened, App, Operator, Views]) -> tuple[Opened, App, Operator, Views]:
+    """The page in the step Scan, without edits, errors or region."""
+    opened, app, operator, views = shared_wizard
+    for name in ("one", "two"):
+        while operator.wait_until_idle(PATIENCE_S).scan(name).edits:  # type: ignore[union-attr]
+            assert operator.undo_edit(name)
+    opened.errors.clear()
+    click(opened.page, "6. Scan")
+    choose(opened.page, "Scan", "one")
+    expect(opened.page.get_by_text(re.compile("points shown; the file has all"))).to_be_visible()
+    return opened, app, operator, views
 
 
 def unfold(page: Page, folder: str) -> None:
@@ -83,13 +125,37 @@ def to_screen(app: App, page: Page, point: np.ndarray) -> tuple[float, float]:
     return box["x"] + x * box["width"], box["y"] + y * box["height"]
 
 
+def draw_outline(page: Page, x: float, y: float) -> None:
+    """Click the corners of an outline around (x, y) px, each once the wizard has the one before, and close it."""
+    for count, (dx, dy) in enumerate(CORNERS, 1):
+        page.mouse.click(x + dx, y + dy)
+        expect(page.get_by_text(re.compile(f"{count} corners? set"))).to_be_visible()
+    click(page, "Close outline")
+    wait_until(page, lambda: count_selected(page) > 0)
+
+
+def wait_for_frames(page: Page, count: int = 3) -> None:
+    """Wait until the page has drawn so many frames: what lies below the mouse is looked up in each of them."""
+    for _ in range(count):
+        page.evaluate("new Promise(requestAnimationFrame)")
+
+
+def drag_rectangle(page: Page, x: float, y: float, size: float) -> None:
+    """Drag a rectangle around (x, y) px."""
+    page.mouse.move(x - size, y - size)
+    page.mouse.down()
+    page.mouse.move(x, y, steps=4)
+    page.mouse.move(x + size, y + size, steps=4)
+    page.mouse.up()
+
+
 def count_selected(page: Page) -> int:
     text = page.get_by_text(re.compile(r"of [\d,]+ points selected")).text_content() or ""
     return int(text.split(" of ")[0].replace(",", ""))
 
 
-def test_points_are_selected_deleted_and_brought_back(wizard: tuple[Opened, App, Operator]) -> None:
-    opened, app, operator = wizard
+def test_points_are_selected_deleted_and_restored(wizard: tuple[Opened, App, Operator, Views]) -> None:
+    opened, app, operator, views = wizard
     page = opened.page
     assert operator.session is not None
     cloud = whole_cloud(operator.session, "one")
@@ -97,13 +163,10 @@ def test_points_are_selected_deleted_and_brought_back(wizard: tuple[Opened, App,
     v, u = valid[np.argmin(np.abs(valid - np.median(valid, axis=0)).sum(axis=1))]
     unfold(page, "Edit points")
     choose(page, "Select by", "lasso")
-    page.wait_for_timeout(1500)  # the view moves to the cloud
+    expect(page.get_by_text("Click around the points")).to_be_visible()
+    views.wait_for(page, cloud.points)
     x, y = to_screen(app, page, cloud.points[v, u])
-    for dx, dy in ((-30, -30), (30, -30), (30, 30), (-30, 30)):
-        page.mouse.click(x + dx, y + dy)
-        page.wait_for_timeout(400)
-    click(page, "Close outline")
-    wait_until(page, lambda: count_selected(page) > 0)
+    draw_outline(page, x, y)
     selected = count_selected(page)
     assert 20 < selected < 0.5 * len(valid)
     click(page, "Delete selected")
@@ -114,12 +177,9 @@ def test_points_are_selected_deleted_and_brought_back(wizard: tuple[Opened, App,
     assert scan_cloud(operator.session, "one").measured_count == len(valid) - selected
 
     choose(page, "Select by", "rectangle")
-    page.wait_for_timeout(500)
-    page.mouse.move(x - 60, y - 60)
-    page.mouse.down()
-    page.mouse.move(x, y, steps=4)
-    page.mouse.move(x + 60, y + 60, steps=4)
-    page.mouse.up()
+    expect(page.get_by_text("Drag a rectangle")).to_be_visible()
+    wait_until_still(page)
+    drag_rectangle(page, x, y, 60)
     wait_until(page, lambda: count_selected(page) > 0)
     click(page, "Invert selection")
     total = len(valid) - selected
@@ -133,32 +193,31 @@ def test_points_are_selected_deleted_and_brought_back(wizard: tuple[Opened, App,
     expect(page.get_by_text(re.compile("points shown; the file has all"))).to_be_visible()
     click(page, "Redo edit")
     wait_until(page, lambda: len(operator.snapshot().scan("one").edits) == 1)  # type: ignore[union-attr]
+    choose(page, "Select by", "off")  # drags turn the view again
     assert cut_labels(page) == []
     assert opened.errors == []
 
 
-def test_points_of_two_scans_are_deleted_and_brought_back_in_the_step_merge(
-    wizard: tuple[Opened, App, Operator],
+@pytest.mark.slow
+def test_points_of_two_scans_are_deleted_and_restored_in_step_merge(
+    wizard: tuple[Opened, App, Operator, Views],
 ) -> None:
-    opened, app, operator = wizard
+    opened, app, operator, views = wizard
     page = opened.page
     operator.reconstruct("two")
-    operator.wait_until_idle()
+    operator.wait_until_idle(PATIENCE_S)
     assert operator.session is not None
     points = whole_cloud(operator.session, "one").points
     click(page, "7. Merge")
     expect(button(page, "Merge 2 scans")).to_be_visible()
     unfold(page, "Edit points")
     choose(page, "Select by", "lasso")
-    page.wait_for_timeout(1500)  # the view moves to the clouds
+    expect(page.get_by_text("Click around the points")).to_be_visible()
+    views.wait_for(page, points)
     valid = np.argwhere(np.isfinite(points[..., 2]))
     v, u = valid[np.argmin(np.abs(valid - np.median(valid, axis=0)).sum(axis=1))]
     x, y = to_screen(app, page, points[v, u])
-    for dx, dy in ((-30, -30), (30, -30), (30, 30), (-30, 30)):
-        page.mouse.click(x + dx, y + dy)
-        page.wait_for_timeout(400)
-    click(page, "Close outline")
-    wait_until(page, lambda: count_selected(page) > 0)
+    draw_outline(page, x, y)
     selected = count_selected(page)
 
     def edits() -> list[int]:
@@ -175,8 +234,9 @@ def test_points_of_two_scans_are_deleted_and_brought_back_in_the_step_merge(
     assert opened.errors == []
 
 
-def test_the_region_is_placed_by_numbers_and_by_its_handle(wizard: tuple[Opened, App, Operator]) -> None:
-    opened, app, operator = wizard
+@pytest.mark.slow
+def test_region_is_set_by_numbers_and_by_handle(wizard: tuple[Opened, App, Operator, Views]) -> None:
+    opened, app, operator, _ = wizard
     page = opened.page
     assert operator.session is not None
     total = whole_cloud(operator.session, "one").measured_count
@@ -196,19 +256,18 @@ def test_the_region_is_placed_by_numbers_and_by_its_handle(wizard: tuple[Opened,
     assert 0.2 * total < scan_cloud(operator.session, "one").measured_count < 0.9 * total
     expect(page.get_by_text(re.compile("removed by edits and region"))).to_be_visible()
     page.locator("xpath=//*[normalize-space(text())='Handles']/following::input[1]").check()
-    page.wait_for_timeout(1500)
-    for share in (0.3, 0.25, 0.35, 0.3):  # of the box, along the arrow; what is drawn just then may take the drag
+    for share in 10 * (0.3, 0.25, 0.35):  # of the box, along the arrow; what is drawn just then may take the drag
+        wait_until_still(page)
         start = region()
         arrow = np.array([share * max(start.size_mm), 0, 0])
         x, y = to_screen(app, page, np.array(start.centre_mm) + arrow)
         page.mouse.move(x, y)
-        page.wait_for_timeout(200)
+        wait_for_frames(page)
         page.mouse.down()
         page.mouse.move(x + 20, y, steps=4)
         page.mouse.move(x + 60, y, steps=6)
         page.mouse.up()
-        page.wait_for_timeout(1500)
-        if abs(region().centre_mm[0] - automatic.centre_mm[0]) > 1:
+        if operator.wait_for(lambda _: abs(region().centre_mm[0] - automatic.centre_mm[0]) > 1, 2.0):
             break
     assert abs(region().centre_mm[0] - automatic.centre_mm[0]) > 1
     assert np.allclose(region().size_mm[1:], automatic.size_mm[1:], atol=0.11)
@@ -221,7 +280,8 @@ def test_the_region_is_placed_by_numbers_and_by_its_handle(wizard: tuple[Opened,
     assert opened.errors == []
 
 
-def test_six_clicks_make_a_clean_textured_mesh_of_a_part_on_a_table(tmp_path: Path, browser: Browser) -> None:
+@pytest.mark.slow
+def test_six_clicks_make_textured_mesh_of_part_without_its_table(tmp_path: Path, browser: Browser) -> None:
     folder, rig = tmp_path / "session", letter(0.25)
     true_calibration(folder, rig)
     world = SimulatedWorld(rig)
@@ -230,17 +290,16 @@ def test_six_clicks_make_a_clean_textured_mesh_of_a_part_on_a_table(tmp_path: Pa
     capture_scans(folder, world, names, "p18")
     with Operator(folder) as operator:
         app = App(operator, Serving(port=0))
-        page = browser.new_page(viewport=SIZE)
-        page.set_default_timeout(60_000)
+        page = new_page(browser)
         opened = Opened(page)
         page.goto(app.server.link())
         click(page, "6. Scan")
         for name in names:  # as a capture does with "Align as you scan"
             operator.reconstruct(name)
-            operator.wait_until_idle()
+            operator.wait_until_idle(PATIENCE_S)
             operator.align(name)
-            operator.wait_until_idle()
-        expect(page.get_by_text("seen by more than one; gaps")).to_be_visible(timeout=PATIENCE_S * 1000)
+            operator.wait_until_idle(PATIENCE_S)
+        expect(page.get_by_text("seen by more than one; gaps")).to_be_visible()
         page.evaluate("window.clicks = 0; addEventListener('click', () => window.clicks++, true)")
 
         click(page, "Remove support, 3 scans")
@@ -251,13 +310,13 @@ def test_six_clicks_make_a_clean_textured_mesh_of_a_part_on_a_table(tmp_path: Pa
         click(page, "9. Export")
         click(page, "Write textured mesh")
         link = page.get_by_role("link", name=re.compile(r"Download .*\.glb"))
-        expect(link).to_be_visible(timeout=3 * PATIENCE_S * 1000)
+        expect(link).to_be_visible()
         with page.expect_download() as started:
             link.click()
         assert page.evaluate("window.clicks") == 6
         started.value.save_as(tmp_path / "part.glb")
         assert opened.errors == []
-        page.close()
+        page.context.close()
         app.close()
     mesh = trimesh.load(tmp_path / "part.glb", force="mesh")
     points = 1000 * mesh.vertices * [1, -1, -1]  # GLB: m, y up
@@ -270,7 +329,8 @@ def test_six_clicks_make_a_clean_textured_mesh_of_a_part_on_a_table(tmp_path: Pa
     assert np.asarray(mesh.visual.material.baseColorTexture).shape[:2] == (2048, 2048)
 
 
-def test_a_plan_is_made_uploaded_and_run_on_two_scans(tmp_path: Path, browser: Browser) -> None:
+@pytest.mark.slow
+def test_plan_is_made_uploaded_and_run_on_two_scans(tmp_path: Path, browser: Browser) -> None:
     folder, rig = tmp_path / "session", letter(0.25)
     true_calibration(folder, rig)
     world = SimulatedWorld(rig)
@@ -279,24 +339,20 @@ def test_a_plan_is_made_uploaded_and_run_on_two_scans(tmp_path: Path, browser: B
     with Operator(folder) as operator:
         for name in ("a", "b"):
             operator.reconstruct(name)
-            operator.wait_until_idle()
+            operator.wait_until_idle(PATIENCE_S)
         top = world.pose.t - [0.0, 0.0, 98.0]
         app = App(operator, Serving(port=0))
-        page = browser.new_page(viewport=SIZE)
-        page.set_default_timeout(60_000)
+        views = Views(app)
+        page = new_page(browser)
         opened = Opened(page)
         page.goto(app.server.link())
         click(page, "8. Measure")
-        page.wait_for_timeout(2500)  # the view moves to the surface
+        views.wait_for(page, scan_cloud(operator.session, "a").points)
         page.get_by_text("Sphere", exact=True).click()
         choose(page, "Region", "rectangle")
-        page.wait_for_timeout(500)
+        wait_until_still(page)
         x, y = to_screen(app, page, top)
-        page.mouse.move(x - 50, y - 50)
-        page.mouse.down()
-        page.mouse.move(x, y, steps=4)
-        page.mouse.move(x + 50, y + 50, steps=4)
-        page.mouse.up()
+        drag_rectangle(page, x, y, 50)
         expect(page.get_by_text(re.compile(r"[\d,]+ points in the box"))).to_be_visible()
         click(page, "Fit sphere")
         wait_until(page, lambda: len(operator.snapshot().session.measurements) == 1)  # type: ignore[union-attr]
@@ -330,9 +386,9 @@ def test_a_plan_is_made_uploaded_and_run_on_two_scans(tmp_path: Path, browser: B
             wait_until(page, lambda count=count: len(operator.snapshot().session.plans) == count)  # type: ignore[misc,union-attr]
             choose(page, "Plan", f"{name}.toml")
             click(page, "Run plan")
-            expect(page.get_by_text(judged, exact=True)).to_be_visible(timeout=PATIENCE_S * 1000)
+            expect(page.get_by_text(judged, exact=True)).to_be_visible()
         assert "small" in (folder / "exports" / "parts.html").read_text()
         assert cut_labels(page) == []
         assert opened.errors == []
-        page.close()
+        page.context.close()
         app.close()

@@ -4,20 +4,14 @@ import posixpath
 import re
 from pathlib import Path
 
-from playwright.sync_api import Browser, Locator, Page, expect
-from wizard_page import SIZE, Opened, click
-
 from slviewer import wizard
 from slviewer.calibration.diagnosis.verdict import CAUSES, Finding, Verdict
-from slviewer.gui.app import App
 from slviewer.gui.calibration_html import verdict_html
 from slviewer.gui.help_links import FINDINGS, FINDINGS_PAGE, STAGES, STEPS_PAGE, help_link, step_help_link
 from slviewer.gui.merge_html import merge_failure_html
 from slviewer.gui.rig_check import checks_table
-from slviewer.pipeline.calibration_verdict import save_verdict
 from slviewer.pipeline.check_results import CHECK_NAMES, Check, Preflight
 from slviewer.server.help_pages import HelpPages, docs_folder
-from slviewer.wizard.operator import Operator
 from slviewer.wizard.steps import STEPS
 
 
@@ -73,50 +67,3 @@ def test_findings_checks_and_refusals_link_to_their_sections() -> None:
     assert linked == [f"help/{FINDINGS_PAGE}#check-{name}" for name in CHECK_NAMES if name != "noise"]
     assert hrefs(merge_failure_html("no", {}, None, "plane")) == [f"help/{FINDINGS_PAGE}#merge-plane"]
     assert hrefs(merge_failure_html("no", {})) == hrefs(help_link("merge"))
-
-
-def test_help_opens_beside_the_wizard(opened: Opened, app: App, operator: Operator, browser: Browser) -> None:
-    page = opened.page
-
-    def follow(link: Locator, heading: str) -> Page:
-        """Click a link, and return the tab with the heading that it opens."""
-        with page.context.expect_page() as shown:
-            link.click()
-        expect(shown.value.locator(":target")).to_have_text(heading)
-        assert shown.value.evaluate("window.opener") is None
-        return shown.value
-
-    step_help = page.get_by_role("link", name="Help").first
-    click(page, "1. Rig")
-    expect(step_help).to_have_attribute("href", "help/howto/wizard.md#rig")
-    follow(step_help, "Rig").close()
-    click(page, "2. Target")
-    expect(step_help).to_have_attribute("href", "help/howto/wizard.md#target")
-    tab = follow(step_help, "Target")
-
-    tab.get_by_role("link", name="Warnings and findings").first.click()
-    expect(tab.get_by_role("heading", level=1)).to_have_text("Warnings and findings")
-    tab.get_by_role("link", name="exposures").first.click()
-    expect(tab.get_by_role("heading", level=1)).to_have_text("Choosing exposures")
-    address = tab.url
-    tab.close()
-
-    save_verdict(operator.session, Verdict.of([Finding("moved", "rejected", "pose_03 moved", "hold it still")]), ())
-    operator.choose_target("circles:21x16:9")
-    click(page, "4. Calibrate")
-    finding = page.locator("a[href$='#moved']")
-    follow(finding, "Moved").close()
-
-    viewer = browser.new_context(viewport=SIZE).new_page()
-    viewer.goto(app.server.link("watch"))
-    viewer.locator("a[href$='#moved']").wait_for()
-    with viewer.context.expect_page() as shown:
-        viewer.locator("a[href$='#moved']").click()
-    expect(shown.value.locator(":target")).to_have_text("Moved")
-    viewer.context.close()
-
-    stranger = browser.new_context().new_page()
-    answer = stranger.goto(address)
-    assert answer is not None and answer.status == 403 and "xposure" not in stranger.content()
-    stranger.context.close()
-    assert opened.errors == []

@@ -1,60 +1,193 @@
-"""The frame of the page, as someone sees it who opens it: the steps, one pose, a reload, a guest, a failure."""
+"""The frame of the page, as someone sees it who opens it: the step, a guest, the links, the help, a failure."""
 
-import time
 import webbrowser
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 import zstandard
-from playwright.sync_api import Browser, expect
-from wizard_page import SIZE, Opened, button, choose, click, field
+from facts import raises
+from playwright.sync_api import Browser, Locator, Page, expect
+from wizard_page import PATIENCE_S, RIG, Opened, button, choose, click, field, new_page, wait_until
 
+from slviewer.calibration.diagnosis.verdict import Finding, Verdict
 from slviewer.errors import UsageError
 from slviewer.gui.app import App, browser_opened, rig_choice
+from slviewer.pipeline.calibration_verdict import save_verdict
+from slviewer.pipeline.rig_presets import save_rig
+from slviewer.server.secure import Serving
 from slviewer.wizard.operator import Operator
 
-STEPS = ("Rig", "Target", "Poses", "Calibrate", "Verify", "Scan", "Merge", "Measure", "Export")
+
+@pytest.fixture(scope="module")
+def app(tmp_path_factory: pytest.TempPathFactory) -> Iterator[App]:
+    """One wizard for all tests of this file."""
+    with Operator(tmp_path_factory.mktemp("shell") / "session", RIG) as operator:
+        assert operator.wait_for(lambda s: s.rig.state == "open", PATIENCE_S) is not None
+        wizard = App(operator, Serving(port=0))
+        yield wizard
+        wizard.close()
 
 
-def test_from_the_link_to_a_pose_that_a_reload_keeps(opened: Opened, operator: Operator) -> None:
-    page = opened.page
-    for number, title in enumerate(STEPS, 1):
-        expect(button(page, f"{number}. {title}")).to_be_visible()
+@pytest.fixture(scope="module")
+def shared_page(browser: Browser, app: App) -> Iterator[Opened]:
+    page = new_page(browser)
+    found = Opened(page)
+    page.goto(app.server.link())
+    button(page, "1. Rig").wait_for()
+    yield found
+    page.context.close()
 
-    click(page, "2. Target")
-    click(page, "Use this board")
-    expect(page.get_by_text("In use: circles:21x16:9")).to_be_visible()
-    click(page, "Continue to Poses")
-    expect(page.get_by_text("Board detected: 336 of 336 features")).to_be_visible()
-    click(page, "Place board")
-    click(page, "Capture pose")
-    expect(page.get_by_text("pose_01").first).to_be_visible()
-    assert operator.wait_for(lambda s: (p := s.pose("pose_01")) is not None and p.state == "good", 30.0)
-    expect(page.get_by_text("1 pose, 0 scans")).to_be_visible()
 
+@pytest.fixture
+def opened(shared_page: Opened) -> Opened:
+    """The operator's page, which has reported no error in this test yet."""
+    shared_page.errors.clear()
+    return shared_page
+
+
+@pytest.fixture(scope="module")
+def shared_guest(browser: Browser, app: App) -> Iterator[Opened]:
+    page = new_page(browser)
+    found = Opened(page)
+    page.goto(app.server.link("watch"))
+    expect(page.get_by_text("View only")).to_be_visible()
+    yield found
+    page.context.close()
+
+
+def test_guest_sees_same_step_and_changes_nothing(opened: Opened, shared_guest: Opened, app: App) -> None:
+    guest = shared_guest.page
+    click(opened.page, "2. Target")
+    expect(button(guest, "Use this board")).to_be_visible()
+    shared_guest.send(lambda: click(guest, "1. Rig"), "GuiUpdateMessage")
+    click(opened.page, "Use this board")  # what the operator requests after that is all that happens
+    expect(guest.get_by_text("In use: circles:21x16:9")).to_be_visible()
+    assert app.shell.current == "target"
+
+
+def test_refused_rig_leaves_the_one_in_use(opened: Opened, app: App, tmp_path: Path) -> None:
+    page, operator = opened.page, app.operator
+    assert operator.session is not None
+    camera = {"driver": "opencv", "source": str(tmp_path / "no.avi")}
+    save_rig(operator.session, "gone", {"camera": camera, "projector": {"driver": "browser", "size": [640, 480]}})
+    assert operator.set_hands_free(False)  # anything that has the session read anew
+    click(page, "1. Rig")
+    for count in (1, 2):  # it can be tried again
+        choose(page, "Rig", "gone")
+        assert operator.wait_for(lambda s, n=count: sum("no.avi" in each.text for each in s.notices) == n, PATIENCE_S)  # type: ignore[misc]
+        expect(page.get_by_text("no.avi").first).to_be_visible()
+        expect(field(page, "Rig")).to_have_value("Simulated, quarter size")
+    assert operator.snapshot().rig.state == "open"
+
+
+def test_camera_password_is_sent_to_operators_only(
+    opened: Opened, shared_guest: Opened, caplog: pytest.LogCaptureFixture
+) -> None:
+    page, guest = opened.page, shared_guest.page
+    received: list[bytes | str] = []
+    guest.on("websocket", lambda socket: socket.on("framereceived", lambda frame: received.append(frame)))
+    guest.reload()
+    expect(guest.get_by_text("View only")).to_be_visible()
+    click(page, "1. Rig")
+    choose(page, "Rig", "Custom …")
+    opened.enter("Camera ID", "rtsp://admin:hunter2@127.0.0.1:9/stream")
+    click(page, "Use these devices")
+    expect(page.get_by_text("127.0.0.1/stream").first).to_be_visible()
     page.reload()
-    expect(page.get_by_text("1 pose, 0 scans")).to_be_visible()
-    expect(button(page, "Capture pose")).to_be_visible()
-    expect(page.get_by_text("good", exact=True).first).to_be_visible()
+    expect(field(page, "Camera ID")).to_have_value("rtsp://admin:hunter2@127.0.0.1:9/stream")
+    guest.reload()
+    expect(guest.get_by_text("127.0.0.1/stream").first).to_be_visible()
+    shown = "".join(field(guest, "Camera ID").input_value() + guest.content())
+    messages = "".join(unpacked(frame) for frame in received)
+    assert "Camera ID" in messages and "hunter2" not in shown + caplog.text + messages
+
+
+def unpacked(frame: bytes | str) -> str:
+    """The text of a frame that viser's server sent."""
+    assert isinstance(frame, bytes)
+    size = int.from_bytes(frame[8:16], "little")
+    inner = zstandard.ZstdDecompressor().decompress(frame[16 : 16 + size], int.from_bytes(frame[:8], "little"))
+    return inner.decode("latin-1")
+
+
+def test_browser_opens_one_time_link_from_private_file(
+    app: App, browser: Browser, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    given: list[str] = []
+    monkeypatch.setattr(Path, "home", lambda: tmp_path)
+    monkeypatch.setattr(webbrowser, "get", lambda: None)
+    monkeypatch.setattr(webbrowser, "open", given.append)
+    page = new_page(browser)
+    with browser_opened(app.server):
+        wait_until(page, lambda: given)
+        (address,) = given
+        file = Path(address.removeprefix("file://"))
+        assert file.stat().st_mode & 0o777 == 0o600 and file.parent.stat().st_mode & 0o777 == 0o700
+        assert not [grant for grant in app.server.access.grants.values() if grant.token in address + file.read_text()]
+        page.goto(address)
+        page.wait_for_url("**/operate-*/")
+        wait_until(page, lambda: not file.exists())
+    page.context.close()
+
+
+def test_invalid_session_folder_is_reported(opened: Opened, tmp_path: Path) -> None:
+    (tmp_path / "a file").write_text("not a session")
+    page = opened.page
+    opened.enter("Folder", str(tmp_path / "a file"))
+    click(page, "Open session")
+    expect(page.get_by_role("alert").filter(has_text="Error").filter(has_text="a file").first).to_be_visible()
     assert opened.errors == []
 
 
-def test_a_guest_sees_the_same_step_and_changes_nothing(opened: Opened, app: App, browser: Browser) -> None:
-    guest = browser.new_context(viewport=SIZE).new_page()
-    guest.goto(app.server.link("watch"))
-    expect(guest.get_by_text("View only")).to_be_visible()
-    click(opened.page, "2. Target")
-    expect(button(guest, "Use this board")).to_be_visible()
-    click(guest, "1. Rig")
-    guest.wait_for_timeout(500)
-    assert app.shell.current == "target"
-    guest.context.close()
+def test_help_opens_in_another_tab(opened: Opened, shared_guest: Opened, app: App, browser: Browser) -> None:
+    page, operator, viewer = opened.page, app.operator, shared_guest.page
+
+    def follow(link: Locator, heading: str) -> Page:
+        """Click a link, and return the tab with the heading that it opens."""
+        with page.context.expect_page() as shown:
+            link.click()
+        expect(shown.value.locator(":target")).to_have_text(heading)
+        assert shown.value.evaluate("window.opener") is None
+        return shown.value
+
+    step_help = page.get_by_role("link", name="Help").first
+    click(page, "1. Rig")
+    expect(step_help).to_have_attribute("href", "help/howto/wizard.md#rig")
+    follow(step_help, "Rig").close()
+    click(page, "2. Target")
+    expect(step_help).to_have_attribute("href", "help/howto/wizard.md#target")
+    tab = follow(step_help, "Target")
+
+    tab.get_by_role("link", name="Warnings and findings").first.click()
+    expect(tab.get_by_role("heading", level=1)).to_have_text("Warnings and findings")
+    tab.get_by_role("link", name="exposures").first.click()
+    expect(tab.get_by_role("heading", level=1)).to_have_text("Choosing exposures")
+    address = tab.url
+    tab.close()
+
+    save_verdict(operator.session, Verdict.of([Finding("moved", "rejected", "pose_03 moved", "hold it still")]), ())
+    operator.choose_target("circles:21x16:9")
+    click(page, "4. Calibrate")
+    finding = page.locator("a[href$='#moved']")
+    follow(finding, "Moved").close()
+
+    viewer.locator("a[href$='#moved']").wait_for()
+    with viewer.context.expect_page() as shown:
+        viewer.locator("a[href$='#moved']").click()
+    expect(shown.value.locator(":target")).to_have_text("Moved")
+
+    stranger = new_page(browser)
+    answer = stranger.goto(address)
+    assert answer is not None and answer.status == 403 and "xposure" not in stranger.content()
+    stranger.context.close()
+    assert opened.errors == []
 
 
-def test_new_links_end_what_the_old_ones_opened(opened: Opened, app: App, browser: Browser) -> None:
+@pytest.mark.slow
+def test_new_links_invalidate_old_ones(opened: Opened, shared_guest: Opened, app: App) -> None:
     page, old = opened.page, app.server.link("watch")
-    guest = browser.new_context(viewport=SIZE).new_page()
-    guest.goto(old)
+    guest = shared_guest.page
     expect(guest.get_by_text("View only")).to_be_visible()
     click(page, "Links")
     expect(page.get_by_text(old)).to_be_visible()
@@ -68,76 +201,10 @@ def test_new_links_end_what_the_old_ones_opened(opened: Opened, app: App, browse
     expect(guest.get_by_text("no longer valid")).to_be_visible()
     guest.goto(old)
     expect(guest.get_by_text("no longer, valid")).to_be_visible()
-    guest.context.close()
-
-
-def test_the_password_of_a_camera_reaches_operators_alone(
-    opened: Opened, app: App, browser: Browser, caplog: pytest.LogCaptureFixture
-) -> None:
-    page = opened.page
-    received: list[bytes | str] = []
-    guest = browser.new_context(viewport=SIZE).new_page()
-    guest.on("websocket", lambda socket: socket.on("framereceived", lambda frame: received.append(frame)))
-    guest.goto(app.server.link("watch"))
-    expect(guest.get_by_text("View only")).to_be_visible()
-    click(page, "1. Rig")
-    choose(page, "Rig", "Custom …")
-    field(page, "Camera ID").fill("rtsp://admin:hunter2@127.0.0.1:9/stream")
-    page.wait_for_timeout(500)
-    click(page, "Use these devices")
-    expect(page.get_by_text("127.0.0.1/stream").first).to_be_visible()
-    page.reload()
-    expect(field(page, "Camera ID")).to_have_value("rtsp://admin:hunter2@127.0.0.1:9/stream")
-    guest.reload()
-    expect(guest.get_by_text("127.0.0.1/stream").first).to_be_visible()
-    shown = "".join(field(guest, "Camera ID").input_value() + guest.content())
-    assert "hunter2" not in shown + caplog.text + "".join(unpacked(frame) for frame in received)
-    guest.context.close()
-
-
-def unpacked(frame: bytes | str) -> str:
-    """The text of a frame that viser's server sent."""
-    assert isinstance(frame, bytes)
-    size = int.from_bytes(frame[8:16], "little")
-    inner = zstandard.ZstdDecompressor().decompress(frame[16 : 16 + size], int.from_bytes(frame[:8], "little"))
-    return inner.decode("latin-1")
-
-
-def test_the_browser_is_handed_a_one_time_link_in_a_private_file(
-    app: App, browser: Browser, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    given: list[str] = []
-    monkeypatch.setattr(Path, "home", lambda: tmp_path)
-    monkeypatch.setattr(webbrowser, "get", lambda: None)
-    monkeypatch.setattr(webbrowser, "open", given.append)
-    page = browser.new_context(viewport=SIZE).new_page()
-    with browser_opened(app.server):
-        while not given:
-            time.sleep(0.01)
-        (address,) = given
-        file = Path(address.removeprefix("file://"))
-        assert file.stat().st_mode & 0o777 == 0o600 and file.parent.stat().st_mode & 0o777 == 0o700
-        assert not [grant for grant in app.server.access.grants.values() if grant.token in address + file.read_text()]
-        page.goto(address)
-        page.wait_for_url("**/operate-*/")
-        end = time.monotonic() + 5
-        while file.exists() and time.monotonic() < end:
-            page.wait_for_timeout(50)
-        assert not file.exists()
-    page.context.close()
-
-
-def test_what_cannot_be_done_is_said_in_words(opened: Opened, tmp_path: Path) -> None:
-    (tmp_path / "a file").write_text("not a session")
-    page = opened.page
-    field(page, "Folder").fill(str(tmp_path / "a file"))
-    click(page, "Open session")
-    expect(page.get_by_text("Error", exact=True).first).to_be_visible()
-    assert opened.errors == []
 
 
 @pytest.mark.parametrize("text", ["simulated:half", "simulated:1,5"])
-def test_a_rig_that_is_none(text: str) -> None:
+def test_rig_choice_refuses_invalid_scale(text: str) -> None:
     assert rig_choice("simulated:0.25") == {"driver": "simulated", "scale": 0.25}
-    with pytest.raises(UsageError, match="rig"):
+    with raises(UsageError, "rig", text):
         rig_choice(text)

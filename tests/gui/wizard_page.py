@@ -4,11 +4,13 @@ import re
 import time
 from collections.abc import Callable
 
-from playwright.sync_api import ConsoleMessage, Locator, Page, TimeoutError, expect
+from playwright.sync_api import Browser, ConsoleMessage, Locator, Page, TimeoutError, ViewportSize, expect
 
-SIZE = {"width": 1280, "height": 800}
-PATIENCE_MS = 120_000
-"""For what is computed, on a machine that is busy with other things."""
+SIZE: ViewportSize = {"width": 1280, "height": 800}
+RIG = {"driver": "simulated", "scale": 0.25}
+PATIENCE_S = 600.0
+"""After which something hangs: a busy machine may take minutes for kernels and for a browser that draws in software."""
+PATIENCE_MS = 1000 * PATIENCE_S
 SMALL_CANVAS = """
 for (const side of ["width", "height"]) {
   const own = Object.getOwnPropertyDescriptor(HTMLCanvasElement.prototype, side);
@@ -21,6 +23,12 @@ HTMLCanvasElement.prototype.getContext = function (kind, options) {
 };
 """
 """Draws the scene with a sixteenth of the pixels: here they are drawn in software, and no test looks at them."""
+FEW_FRAMES = """
+const nextFrame = window.requestAnimationFrame.bind(window);
+window.requestAnimationFrame = draw => setTimeout(() => nextFrame(draw), 80);
+window.cancelAnimationFrame = clearTimeout;
+"""
+"""Draws the scene about ten times a second."""
 
 
 UNKNOWN = "Tried to update non-existent component"
@@ -34,7 +42,10 @@ class Opened:
         self.page = page
         self.errors: list[str] = []
         self._unknown = 0
+        self._sent: list[bytes] = []
         page.add_init_script(SMALL_CANVAS)
+        page.add_init_script(FEW_FRAMES)
+        page.on("websocket", lambda socket: socket.on("framesent", self._record_sent))
         page.on("console", self._heard)
         page.on("pageerror", lambda error: self.errors.append(error.stack or str(error)))
 
@@ -42,10 +53,38 @@ class Opened:
         if message.type == "error" and (UNKNOWN not in message.text or self._is_repeated()):
             self.errors.append(message.text)
 
+    def _record_sent(self, frame: bytes | str) -> None:
+        self._sent.append(frame if isinstance(frame, bytes) else frame.encode())
+
+    def send(self, act: Callable[[], None], content: str) -> None:
+        """Do something in the page, and wait until the page has sent the server a message with this content."""
+        before = len(self._sent)
+        act()
+        wait_until(self.page, lambda: any(content.encode() in frame for frame in self._sent[before:]))
+
+    def enter(self, label: str, text: str) -> None:
+        """Type a text into the input beside this label, and wait until the server has it: it is sent with a delay."""
+        self.send(lambda: field(self.page, label).fill(text), text)
+
     def _is_repeated(self) -> bool:
         """Whether such a message came before: a handle of ours that is gone would be updated again and again."""
         self._unknown += 1
         return self._unknown > 1
+
+
+def new_page(browser: Browser, size: ViewportSize = SIZE) -> Page:
+    """A page in a context of its own, which waits as long as a busy machine needs."""
+    context = browser.new_context(viewport=size)
+    context.set_default_timeout(PATIENCE_MS)
+    return context.new_page()
+
+
+def wait_until(page: Page, holds: Callable[[], object]) -> None:
+    """Let the page work until something holds."""
+    end = time.monotonic() + PATIENCE_S
+    while not holds():
+        assert time.monotonic() < end, "it did not come about"
+        page.wait_for_timeout(50)
 
 
 def button(page: Page, name: str) -> Locator:
@@ -58,14 +97,19 @@ STILL = """quiet => new Promise(done => {
   let timer = setTimeout(end, quiet);
   const watcher = new MutationObserver(() => { clearTimeout(timer); timer = setTimeout(end, quiet); });
   watcher.observe(document.body, { childList: true, subtree: true });
-  setTimeout(end, 3000);
+  setTimeout(end, 12 * quiet);
 })"""
+
+
+def wait_until_still(page: Page, quiet_ms: float = 250) -> None:
+    """Wait until nothing on the page has changed for so long; at most some seconds where a live image is shown."""
+    page.evaluate(STILL, quiet_ms)
 
 
 def click(page: Page, name: str) -> None:
     """Click the button that says so once the page stands still: what is drawn anew just then may take the click."""
     expect(button(page, name)).to_be_enabled()
-    page.evaluate(STILL, 250)
+    wait_until_still(page)
     button(page, name).click()
 
 
@@ -79,7 +123,7 @@ def choose(page: Page, label: str, option: str) -> None:
     for _ in range(4):
         field(page, label).click()
         try:
-            page.get_by_role("option", name=option, exact=True).click(timeout=PATIENCE_MS / 10)
+            page.get_by_role("option", name=option, exact=True).click(timeout=12_000)
         except TimeoutError:
             page.keyboard.press("Escape")
         else:
@@ -91,7 +135,7 @@ def press(page: Page, name: str, came: Callable[[], bool]) -> None:
     """Press a button until what it asks for has come: what is drawn anew just then may take the click."""
     for _ in range(4):
         button(page, name).click()
-        end = time.monotonic() + PATIENCE_MS / 4000
+        end = time.monotonic() + 30.0
         while time.monotonic() < end:
             if came():
                 return
