@@ -12,7 +12,7 @@ import numpy as np
 
 from slviewer.calibration.guidance.coarse_rig import MIN_POSES as MIN_POSES_FOR_RIG
 from slviewer.calibration.guidance.coarse_rig import ExpectedNoise, GuidanceModel, estimate_rig
-from slviewer.calibration.guidance.pose_selection import suggest_poses
+from slviewer.calibration.guidance.pose_selection import TRIALS, suggest_poses
 from slviewer.calibration.next_pose import (
     Coverage,
     Suggestion,
@@ -119,8 +119,8 @@ class PosePlan:
         return self.sigma_mm is not None and self.sigma_mm <= wanted_mm and len(self.poses) >= MIN_POSES
 
 
-def plan(given: PlanInput, trials: int | None = None) -> PosePlan:
-    """Plan the next pose by information gain, from ``trials`` candidates (None: as many as `suggest_poses` takes).
+def plan(given: PlanInput, trials: int = TRIALS) -> PosePlan:
+    """Plan the next pose by information gain, from ``trials`` drawn candidates.
 
     The rig is the calibrated one, else one estimated from the poses.
     """

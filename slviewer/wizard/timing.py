@@ -1,6 +1,6 @@
 """Rates, delays and counts of what the wizard repeats by itself."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from slviewer.calibration.guidance import pose_selection
 from slviewer.wizard import acquisition, preview_watcher
@@ -16,7 +16,7 @@ class Timing:
     """
 
     retry_s: float = acquisition.RETRY_S
-    previews_per_s: float = field(default_factory=lambda: acquisition.PREVIEWS_PER_S)
-    trials: int = field(default_factory=lambda: pose_selection.TRIALS)
+    previews_per_s: float = acquisition.PREVIEWS_PER_S
+    trials: int = pose_selection.TRIALS
     hold_s: float = preview_watcher.HOLD_S
     count_s: float = preview_watcher.COUNT_S

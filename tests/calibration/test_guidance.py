@@ -4,18 +4,12 @@ import numpy as np
 import pytest
 from splined_rig import BOARD, poses, rig
 
-from slviewer.calibration.guidance import pose_selection
 from slviewer.calibration.guidance.coarse_rig import ExpectedNoise, GuidanceModel, estimate_rig
 from slviewer.calibration.guidance.information import RigInformation, VolumeSensitivity, information_rows
 from slviewer.calibration.guidance.pose_selection import suggest_poses
 from slviewer.calibration.next_pose import depth_range
 from slviewer.geometry.rig import StereoRig
 from slviewer.wizard.pose_plan import MIN_POSES, PlanInput, PoseFeatures, plan
-
-
-@pytest.fixture(autouse=True)
-def few_trials(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pose_selection, "TRIALS", 16)
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +68,7 @@ def test_guided_poses_are_seen_and_know_more_than_others(true, bench, known) -> 
     had = known[1][:3]
     sigmas = []
     for _ in range(3):
-        found = suggest_poses(bench, had)
+        found = suggest_poses(bench, had, trials=16)
         assert found is not None and found.sigma_next_mm < found.sigma_mm
         sigmas.append(found.sigma_mm)
         had = [*had, found.poses[0]]
@@ -102,13 +96,15 @@ def test_noise_that_was_seen_is_expected() -> None:
 def test_a_plan_asks_until_the_wanted_sigma_is_reached(true, seen) -> None:
     sizes = true.camera.size, true.projector.size
     features = {f"pose_{i:02d}": PoseFeatures(*each) for i, each in enumerate(seen)}
-    nothing, few, many = (plan(PlanInput(BOARD, *sizes, dict(list(features.items())[:n]))) for n in (0, 4, MIN_POSES))
+    nothing, few, many = (
+        plan(PlanInput(BOARD, *sizes, dict(list(features.items())[:n])), trials=16) for n in (0, 4, MIN_POSES)
+    )
     assert nothing.sigma_mm is None and nothing.suggestion is not None and not nothing.reaches(1.0)
     assert few.sigma_mm is not None and many.sigma_mm is not None and few.sigma_mm > many.sigma_mm > 0.001
     assert few.sigma_next_mm is not None and few.sigma_next_mm < few.sigma_mm
     assert not few.reaches(2 * few.sigma_mm)  # too few to tell whether all is as it should be
     assert many.reaches(1.01 * many.sigma_mm) and not many.reaches(0.99 * many.sigma_mm)
     assert 0.01 < many.usual_mm < 0.04
-    refused = plan(PlanInput(BOARD, *sizes, dict(list(features.items())[:4]), refused=1))
+    refused = plan(PlanInput(BOARD, *sizes, dict(list(features.items())[:4]), refused=1), trials=16)
     assert refused.suggestion is not None and few.suggestion is not None
     assert not np.allclose(refused.suggestion.T_camera_board, few.suggestion.T_camera_board)

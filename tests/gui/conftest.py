@@ -5,29 +5,18 @@ from pathlib import Path
 
 import pytest
 from playwright.sync_api import Browser, expect
-from wizard_page import PATIENCE_MS, PATIENCE_S, RIG, Opened, button, new_page
+from wizard_page import CALM, PATIENCE_MS, PATIENCE_S, RIG, Opened, button, new_page
 
-from slviewer.calibration.guidance import pose_selection
 from slviewer.gui.app import App
 from slviewer.server.secure import Serving
-from slviewer.wizard import acquisition
 from slviewer.wizard.operator import Operator
 
 expect.set_options(timeout=PATIENCE_MS)
 
 
-@pytest.fixture(scope="module", autouse=True)  # not longer: others measure what is suggested
-def calm() -> Iterator[None]:
-    """Fewer previews, and fewer places tried before one is suggested: a browser draws beside them, in software."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(acquisition, "PREVIEWS_PER_S", 2.0)
-        patch.setattr(pose_selection, "TRIALS", 20)
-        yield
-
-
 @pytest.fixture
 def operator(tmp_path: Path) -> Iterator[Operator]:
-    with Operator(tmp_path / "session", RIG) as engine:
+    with Operator(tmp_path / "session", RIG, timing=CALM) as engine:
         assert engine.wait_for(lambda s: s.rig.state == "open", PATIENCE_S) is not None
         yield engine
 

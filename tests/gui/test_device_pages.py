@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 import pytest
 from playwright.sync_api import Browser, expect
-from wizard_page import PATIENCE_S, choose, click, new_page
+from wizard_page import CALM, PATIENCE_S, choose, click, new_page
 
 from slviewer.devices.browser import PageChannels
 from slviewer.devices.browser_camera import Video
@@ -25,7 +25,7 @@ VIDEO = Video((1920, 1080), "", "Back camera", (), 10.0, True)
 
 def test_wizard_serves_projector_page(browser: Browser) -> None:
     channel = ProjectorChannel()
-    with Operator() as operator:
+    with Operator(timing=CALM) as operator:
         app = App(operator, Serving(port=0), pages=PageChannels(channel))
         page = new_page(browser, {"width": 320, "height": 240})
         try:
@@ -42,7 +42,7 @@ def test_wizard_serves_projector_page(browser: Browser) -> None:
 
 
 def test_wizard_without_page_channel_has_no_projector_page(browser: Browser) -> None:
-    with Operator() as operator:
+    with Operator(timing=CALM) as operator:
         app = App(operator, Serving(port=0))
         page = new_page(browser)
         try:
@@ -65,7 +65,7 @@ def test_qr_code_decodes_to_its_link() -> None:
 @pytest.mark.slow
 def test_operator_sees_state_of_camera_page(browser: Browser) -> None:
     pages = PageChannels()
-    with Operator(set_up=partial(set_up, pages=pages)) as operator:
+    with Operator(set_up=partial(set_up, pages=pages), timing=CALM) as operator:
         app = App(operator, Serving(port=0), pages=pages)
         page = new_page(browser)
         try:

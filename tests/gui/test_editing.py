@@ -11,6 +11,7 @@ import trimesh
 from playwright.sync_api import Browser, Page, expect
 from scipy.spatial import cKDTree
 from wizard_page import (
+    CALM,
     PATIENCE_S,
     Opened,
     button,
@@ -84,7 +85,7 @@ def shared_wizard(
     world = SimulatedWorld(rig)
     world.place("object")
     capture_scans(folder, world, {"one": 0.0, "two": 0.0})
-    with Operator(folder) as operator:
+    with Operator(folder, timing=CALM) as operator:
         operator.reconstruct("one")
         operator.wait_until_idle(PATIENCE_S)
         app = App(operator, Serving(port=0))
@@ -288,7 +289,7 @@ def test_six_clicks_make_textured_mesh_of_part_without_its_table(tmp_path: Path,
     world.place("stone on a table")
     names = {"a": 0.0, "b": 20.0, "c": 40.0}
     capture_scans(folder, world, names, "p18")
-    with Operator(folder) as operator:
+    with Operator(folder, timing=CALM) as operator:
         app = App(operator, Serving(port=0))
         page = new_page(browser)
         opened = Opened(page)
@@ -336,7 +337,7 @@ def test_plan_is_made_uploaded_and_run_on_two_scans(tmp_path: Path, browser: Bro
     world = SimulatedWorld(rig)
     world.place("sphere")
     capture_scans(folder, world, {"a": 0.0, "b": 0.0}, "p18")
-    with Operator(folder) as operator:
+    with Operator(folder, timing=CALM) as operator:
         for name in ("a", "b"):
             operator.reconstruct(name)
             operator.wait_until_idle(PATIENCE_S)

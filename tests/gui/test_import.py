@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 from playwright.sync_api import expect
-from wizard_page import Opened, button, choose, click
+from wizard_page import CALM, Opened, button, choose, click
 
 from slviewer.fringe.patterns import render
 from slviewer.fringe.presets import gray
@@ -22,7 +22,7 @@ PROJECTOR = (120, 90)
 @pytest.fixture
 def operator(tmp_path: Path) -> Iterator[Operator]:
     """A new session without a rig: imported captures need none."""
-    with Operator(tmp_path / "session") as engine:
+    with Operator(tmp_path / "session", timing=CALM) as engine:
         yield engine
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from playwright.sync_api import Browser, expect
-from wizard_page import PATIENCE_S, Opened, click, new_page
+from wizard_page import CALM, PATIENCE_S, Opened, click, new_page
 
 from slviewer.fringe.layout import to_eight_bits
 from slviewer.gui.app import App
@@ -24,7 +24,7 @@ def app(tmp_path: Path) -> Iterator[App]:
     folder = tmp_path / "session"
     true_calibration(folder, letter(SCALE))
     slow = {"driver": "simulated", "scale": SCALE, "settle_ms": 30}  # the browser needs the cores too
-    with Operator(folder, slow) as operator:
+    with Operator(folder, slow, timing=CALM) as operator:
         assert operator.wait_for(lambda s: s.rig.state == "open", PATIENCE_S) is not None
         operator.place("object")
         wizard = App(operator, Serving(port=0))

@@ -15,6 +15,7 @@ import trimesh
 from playwright.sync_api import Browser, Page, expect
 from playwright.sync_api import TimeoutError as NotShownError
 from wizard_page import (
+    CALM,
     PATIENCE_S,
     SIZE,
     Opened,
@@ -61,7 +62,7 @@ def measured(
     folder = shutil.copytree(recorded / "session", tmp_path_factory.mktemp("measured") / "session")
     with Session.open(folder, write=True) as store:
         store.trash_result("calibration/splined")
-    with Operator(folder) as engine:
+    with Operator(folder, timing=CALM) as engine:
         wizard = App(engine, Serving(port=0))
         page = new_page(browser)
         found = Opened(page)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from facts import missing_facts
 from playwright.sync_api import Browser, Page, expect
-from wizard_page import PATIENCE_S, Opened, choose, click, new_page
+from wizard_page import CALM, PATIENCE_S, Opened, choose, click, new_page
 
 from slviewer.devices.browser import PageChannels
 from slviewer.fringe.decode import decode
@@ -50,7 +50,7 @@ def test_network_camera_captures_projector_page(browser: Browser, tmp_path: Path
     pages = PageChannels()
     with (
         network_camera(np.full((SCREEN[1], SCREEN[0], 3), 40, np.uint8)) as camera,
-        Operator(tmp_path / "session", set_up=partial(set_up, pages=pages)) as operator,
+        Operator(tmp_path / "session", set_up=partial(set_up, pages=pages), timing=CALM) as operator,
     ):
         app = App(operator, Serving(port=0), pages=pages)
         page = new_page(browser)

@@ -8,7 +8,7 @@ import pytest
 import zstandard
 from facts import raises
 from playwright.sync_api import Browser, Locator, Page, expect
-from wizard_page import PATIENCE_S, RIG, Opened, button, choose, click, field, new_page, wait_until
+from wizard_page import CALM, PATIENCE_S, RIG, Opened, button, choose, click, field, new_page, wait_until
 
 from slviewer.calibration.diagnosis.verdict import Finding, Verdict
 from slviewer.errors import UsageError
@@ -22,7 +22,7 @@ from slviewer.wizard.operator import Operator
 @pytest.fixture(scope="module")
 def app(tmp_path_factory: pytest.TempPathFactory) -> Iterator[App]:
     """One wizard for all tests of this file."""
-    with Operator(tmp_path_factory.mktemp("shell") / "session", RIG) as operator:
+    with Operator(tmp_path_factory.mktemp("shell") / "session", RIG, timing=CALM) as operator:
         assert operator.wait_for(lambda s: s.rig.state == "open", PATIENCE_S) is not None
         wizard = App(operator, Serving(port=0))
         yield wizard

@@ -15,6 +15,7 @@ import trimesh
 from faulty_rig import FaultyRigs
 from playwright.sync_api import Browser, Page, expect
 from wizard_page import (
+    CALM,
     PATIENCE_S,
     RIG,
     Opened,
@@ -73,7 +74,7 @@ def complaints(caplog: pytest.LogCaptureFixture) -> list[str]:
 @pytest.fixture
 def bare(tmp_path: Path) -> Iterator[Operator]:
     """A new session, and no rig yet."""
-    with Operator(tmp_path / "session") as engine:
+    with Operator(tmp_path / "session", timing=CALM) as engine:
         yield engine
 
 
@@ -381,7 +382,7 @@ def test_killed_capture_costs_no_earlier_pose(tmp_path: Path, browser: Browser) 
 @pytest.mark.slow
 def test_fault_ends_one_capture_and_is_reported(tmp_path: Path, browser: Browser) -> None:
     rigs = FaultyRigs()
-    with Operator(tmp_path / "session", RIG, set_up=rigs) as operator:
+    with Operator(tmp_path / "session", RIG, set_up=rigs, timing=CALM) as operator:
         assert operator.wait_for(lambda s: s.rig.state == "open", PATIENCE_S)
         operator.choose_target(TARGET)
         app = App(operator, Serving(port=0))

@@ -6,7 +6,11 @@ from collections.abc import Callable
 
 from playwright.sync_api import Browser, ConsoleMessage, Locator, Page, TimeoutError, ViewportSize, expect
 
+from slviewer.wizard.timing import Timing
+
 SIZE: ViewportSize = {"width": 1280, "height": 800}
+CALM = Timing(previews_per_s=2.0, trials=20)
+"""Fewer previews, and fewer places tried before one is suggested: a browser draws beside them, in software."""
 RIG = {"driver": "simulated", "scale": 0.25}
 PATIENCE_S = 600.0
 """After which something hangs: a busy machine may take minutes for kernels and for a browser that draws in software."""

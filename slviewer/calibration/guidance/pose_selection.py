@@ -37,12 +37,11 @@ class Guidance:
     sigma_next_mm: float
 
 
-def suggest_poses(model: GuidanceModel, poses: Sequence[Floats], trials: int | None = None) -> Guidance | None:
+def suggest_poses(model: GuidanceModel, poses: Sequence[Floats], trials: int = TRIALS) -> Guidance | None:
     """Recommend the next poses after ``poses``, T_camera_board (4, 4) mm each; None where no pose is visible.
 
-    ``trials``: number of drawn candidates, `TRIALS` by default.
+    ``trials``: number of drawn candidates.
     """
-    trials = TRIALS if trials is None else trials
     candidates = list_candidate_poses(model)
     if not len(candidates):
         return None
