@@ -7,6 +7,8 @@ from fringe_scene import variants
 
 from slviewer.fringe.edge_blur import LEAST_PX, estimate_camera_blur, estimate_displacement
 
+pytestmark = pytest.mark.computes
+
 SHAPE, FINE = (240, 320), 4
 NOISE = 0.5
 

@@ -13,6 +13,8 @@ from slviewer.geometry.rig import StereoRig
 from slviewer.geometry.triangulation import depth_per_px, points_from_depth, triangulate, triangulate_pixels
 from slviewer.records import from_plain, to_plain
 
+pytestmark = pytest.mark.computes
+
 
 def make_rig(k1: float = -0.08, vertical: bool = False) -> StereoRig:
     """A quarter of the Letter's rig; its projector's rows are half as high as its columns are wide."""

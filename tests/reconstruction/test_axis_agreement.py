@@ -15,6 +15,8 @@ from slviewer.geometry.lens import Lens
 from slviewer.geometry.rig import StereoRig
 from slviewer.reconstruction.axis_agreement import check_phases, check_sizes, measure_agreement
 
+pytestmark = pytest.mark.computes
+
 SIZE, PROJECTOR, PERIOD = (160, 120), (912, 1140), 18.0
 SIGMA_PX = 0.03
 CALIBRATED = (500.0, 700.0)
