@@ -150,7 +150,8 @@ def scans(request, tmp_path_factory):
         pytest.skip("there is no CUDA device here")
     here = Path(__file__)
     code = (
-        f"import sys; sys.path.insert(0, {str(here.parent)!r}); import {here.stem} as it; it.scans_to({str(folder)!r})"
+        f"import sys; sys.path[:0] = {[str(here.parent), str(here.parents[1])]!r}; "
+        f"import {here.stem} as it; it.scans_to({str(folder)!r})"
     )
     command = [sys.executable, "-W", "ignore", "-c", code]
     run = subprocess.run(command, cwd=ROOT, env={**os.environ, **there}, capture_output=True, text=True)
