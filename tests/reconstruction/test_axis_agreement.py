@@ -132,9 +132,8 @@ def test_one_axis_is_judged_by_what_the_projector_could_light_and_by_depth() -> 
     true, found = rig(), coordinates(rig())
     for axis in "xy":
         assert check_phases("scan", phases(found, axis), by(true), CALIBRATED).warnings == ()
-    with raises(InputError, "scan", "axis y") as caught:
+    with raises(InputError, "scan", "100 %"):
         check_phases("scan", phases((found + 0.5) / 2 - 0.5, "y"), by(true), CALIBRATED)
-    assert re.search(r"\d+ %", str(caught.value))
     (warning,) = check_phases("scan", phases((found + 0.5) / 3 - 0.5, "x"), by(true), CALIBRATED).warnings
     assert not missing_facts(warning, "350 mm", "980 mm")
 

@@ -133,6 +133,7 @@ def test_cloud_and_its_texture() -> None:
         Cloud(points, "x", "stereo", sigma[1:])
 
 
+@pytest.mark.computes
 def test_normals_of_a_plane() -> None:
     points = plane_grid((60, 80))
     truth = np.array([0.3, -0.2, -1]) / np.linalg.norm([0.3, -0.2, -1])
@@ -147,6 +148,7 @@ def test_normals_of_a_plane() -> None:
     assert tilt[1] > 2 * tilt[2]
 
 
+@pytest.mark.computes
 def test_normals_with_gaps_and_jumps() -> None:
     truth = np.array([0.3, -0.2, -1]) / np.linalg.norm([0.3, -0.2, -1])
     points = plane_grid((60, 80))
