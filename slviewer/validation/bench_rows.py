@@ -112,7 +112,11 @@ AHEAD = 8
 
 
 def gpu_rows(
-    sequence: PatternSequence, model: PixelwiseModel | SplinedModel, frames: np.ndarray
+    sequence: PatternSequence,
+    model: PixelwiseModel | SplinedModel,
+    frames: np.ndarray,
+    times: int = TIMES,
+    ahead: int = AHEAD,
 ) -> list[dict[str, Any]]:
     """One pass over frames (n, h, w) of axis x: the kernel alone, then a whole cloud, repaired, with copies there and
     back; nothing without a device."""
@@ -125,9 +129,9 @@ def gpu_rows(
     scan = one.run(here)
     if cuda_device.find_device() is None:  # it failed, with a warning
         return []
-    alone, least, moved = _time_kernel(one, here, scan.light)
-    whole = median(lambda: one.run(here, scan.light, scan), TIMES)
-    ordinary = median(lambda: one.run(frames, scan.light, scan), TIMES)
+    alone, least, moved = _time_kernel(one, here, scan.light, times, ahead)
+    whole = median(lambda: one.run(here, scan.light, scan), times)
+    ordinary = median(lambda: one.run(frames, scan.light, scan), times)
     stage, fast = f"one pass over {len(frames)} frames, {model.name}, {name}", moved / least / 1e9
     note = f"{least / alone:.0%} of the {fast:.0f} GB/s of a copy on the device"
     return [
@@ -137,7 +141,9 @@ def gpu_rows(
     ]
 
 
-def _time_kernel(one: CudaPass, frames: np.ndarray, light: LightLevels) -> tuple[float, float, int]:
+def _time_kernel(
+    one: CudaPass, frames: np.ndarray, light: LightLevels, times: int, ahead: int
+) -> tuple[float, float, int]:
     """(seconds of the first pass, seconds of a copy on the device that moves as much, bytes moved), by its clock."""
     from numba import cuda
 
@@ -146,8 +152,8 @@ def _time_kernel(one: CudaPass, frames: np.ndarray, light: LightLevels) -> tuple
     source, target = (cuda.device_array(card.bytes_moved // 2, np.uint8) for _ in range(2))
     marks = [cuda.event() for _ in range(3)]
     durations: list[tuple[float, float]] = []
-    for _ in range(TIMES):
-        for _ in range(AHEAD):
+    for _ in range(times):
+        for _ in range(ahead):
             target.copy_to_device(source, stream=card.stream)
         marks[0].record(card.stream)
         target.copy_to_device(source, stream=card.stream)

@@ -1,12 +1,26 @@
 """Frames of a scene whose projector coordinates are known, without any geometry."""
 
+from collections.abc import Iterable
+
 import numpy as np
+import pytest
 from scipy.ndimage import gaussian_filter1d
 
 from slviewer.fringe.patterns import profile
 from slviewer.fringe.phase import PhaseMap
 
 OVERSAMPLING = 8
+
+
+def variants(cases: Iterable, *default) -> list:
+    """Return all cases as parameters of a test; only those given as ``default`` are outside the slow tier."""
+    cases = list(cases)
+    assert all(case in cases for case in default)
+    slow = pytest.mark.slow
+    return [
+        case if case in default else pytest.param(*case if isinstance(case, tuple) else [case], marks=slow)
+        for case in cases
+    ]
 
 
 def slope(height=120, width=200, per_px=0.6, start=40.0):

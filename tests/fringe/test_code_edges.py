@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from fringe_scene import capture, coverage, slope, wrong
+from fringe_scene import capture, coverage, slope, variants, wrong
 
 from slviewer.fringe.decode import decode
 from slviewer.fringe.layout import axis_layout
@@ -11,25 +11,27 @@ from slviewer.fringe.presets import complementary, p18
 from slviewer.fringe.reference_spikes import repair_spikes
 
 PROJECTOR = (912, 1140)
+SEQUENCES = {"p18": p18(PROJECTOR), "complementary": complementary(PROJECTOR, 8, 18.0)}
+CONDITIONS = [
+    (0.5, 0.5, 40, 2, 1.0),
+    (0.5, 0.7, 50, 4, 1.0),
+    (2.0, 0.7, 60, 3, 1.0),
+    (3.0, 1.0, 60, 2, 2.2),
+    (4.0, 0.5, 150, 4, 1.0),
+    (4.5, 2.0, 220, 2, 2.2),
+    (1.0, 3.0, 120, 2, 1.0),
+]
 TWO_PI = 2 * np.pi
 
 
-@pytest.mark.parametrize("sequence", [p18(PROJECTOR), complementary(PROJECTOR, 8, 18.0)], ids=["p18", "complementary"])
-@pytest.mark.parametrize("per_px", [0.25, 0.6, 1.6])
+@pytest.mark.computes
+@pytest.mark.parametrize("name", SEQUENCES)
+@pytest.mark.parametrize("per_px", variants([0.25, 0.6, 1.6], 1.6))
 @pytest.mark.parametrize(
-    ("defocus", "psf", "gain", "read", "gamma"),
-    [
-        (0.5, 0.5, 40, 2, 1.0),
-        (0.5, 0.7, 50, 4, 1.0),
-        (2.0, 0.7, 60, 3, 1.0),
-        (3.0, 1.0, 60, 2, 2.2),
-        (4.0, 0.5, 150, 4, 1.0),
-        (4.5, 2.0, 220, 2, 2.2),
-        (1.0, 3.0, 120, 2, 1.0),
-    ],
+    ("defocus", "psf", "gain", "read", "gamma"), variants(CONDITIONS, CONDITIONS[1], CONDITIONS[5])
 )
-def test_no_wrong_period_survives_blur_and_noise(sequence, per_px, defocus, psf, gain, read, gamma):
-    truth = slope(per_px=per_px)
+def test_no_wrong_period_survives_blur_and_noise(name, per_px, defocus, psf, gain, read, gamma):
+    sequence, truth = SEQUENCES[name], slope(per_px=per_px)
     frames = capture(sequence, truth, defocus=defocus, psf=psf, gain=gain, read=read, gamma=gamma, ambient=20)
     phase = decode(sequence, frames, "x")
     assert wrong(phase, truth) == 0
@@ -37,10 +39,11 @@ def test_no_wrong_period_survives_blur_and_noise(sequence, per_px, defocus, psf,
     assert phase.illuminated.mean() > 0.9
 
 
-@pytest.mark.parametrize("sequence", [p18(PROJECTOR), complementary(PROJECTOR, 8, 18.0)], ids=["p18", "complementary"])
-@pytest.mark.parametrize("jump", [18.0, -18.0, 9.0, 31.3])
-def test_a_depth_step_survives_unaltered_on_both_sides(sequence, jump):
-    truth = slope()
+@pytest.mark.computes
+@pytest.mark.parametrize("name", SEQUENCES)
+@pytest.mark.parametrize("jump", variants([18.0, -18.0, 9.0, 31.3], -18.0))
+def test_a_depth_step_survives_unaltered_on_both_sides(name, jump):
+    sequence, truth = SEQUENCES[name], slope()
     truth[30:90, 60:130] += jump
     phase = decode(sequence, capture(sequence, truth, defocus=0.8, psf=0.15, gain=150), "x")
     assert wrong(phase, truth) == 0
@@ -110,9 +113,10 @@ def test_the_border_of_the_lit_region_stays_and_specks_go():
     assert np.isfinite(settled).sum() == (~outside).sum()
 
 
-@pytest.mark.parametrize("sequence", [p18(PROJECTOR), complementary(PROJECTOR, 8, 18.0)], ids=["p18", "complementary"])
-def test_pixels_that_mix_two_surfaces_are_masked(sequence):
-    truth = slope(160, 240)
+@pytest.mark.computes
+@pytest.mark.parametrize("name", SEQUENCES)
+def test_pixels_that_mix_two_surfaces_are_masked(name):
+    sequence, truth = SEQUENCES[name], slope(160, 240)
     truth[40:120, 80:160] += 31.3
     phase = decode(sequence, capture(sequence, truth, defocus=4.0, psf=1.5, gain=150, read=2.0), "x")
     assert wrong(phase, truth) == 0

@@ -1,6 +1,5 @@
 """What a description says is compared with the frames, and the hypothesis that explains them is named."""
 
-import re
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
@@ -8,6 +7,8 @@ from functools import cache
 import cv2
 import numpy as np
 import pytest
+from facts import missing_facts
+from fringe_scene import variants
 
 from slviewer.devices.capture import capture
 from slviewer.devices.protocols import Rig
@@ -58,6 +59,7 @@ SEQUENCES = {
     "white": with_white_and_black,
     "inverses": with_inverses,
 }
+STEPS_AND_CODE = ["p18", "complementary", "three", "inverses"]
 
 
 @cache
@@ -81,7 +83,7 @@ def causes(sequence: PatternSequence, frames: np.ndarray) -> list[tuple[str, str
     return [(c.cause, c.axis) for c in check_description(sequence, np.array(frames))]
 
 
-@pytest.mark.parametrize("name", SEQUENCES)
+@pytest.mark.parametrize("name", variants(SEQUENCES, "three"))
 @pytest.mark.parametrize(("thing", "gamma"), [("board", 1.0), ("object", 2.2)])
 def test_a_right_description_is_not_doubted(name: str, thing: Thing, gamma: float) -> None:
     sequence, frames = taken(name, thing, gamma)
@@ -100,27 +102,37 @@ def early(frames: np.ndarray) -> np.ndarray:
     return np.roll(frames, -1, axis=0)
 
 
-@pytest.mark.parametrize("name", SEQUENCES)
+@pytest.mark.parametrize("name", variants(SEQUENCES, "three"))
 def test_frames_that_are_all_late_are_named(name: str) -> None:
     sequence, frames = taken(name)
     found = check_description(sequence, late(frames))
     assert [(c.cause, c.value) for c in found] == [("frame-lag", 1.0)]
-    if name not in ("three",):  # of three steps the first may be missed, and nothing is left of that phase
-        found = check_description(sequence, early(frames))
-        assert [(c.cause, c.value) for c in found] == [("frame-lag", -1.0)]
 
 
-@pytest.mark.parametrize(("name", "frame"), [("p18", 4), ("gray", 24), ("complementary", 5), ("multifrequency", 20)])
+@pytest.mark.parametrize("name", variants([name for name in SEQUENCES if name != "three"], "complementary"))
+def test_frames_that_are_all_early_are_named(name: str) -> None:
+    """Of three steps the first may be missed, and nothing is left of that phase."""
+    sequence, frames = taken(name)
+    found = check_description(sequence, early(frames))
+    assert [(c.cause, c.value) for c in found] == [("frame-lag", -1.0)]
+
+
+EXCHANGED = [("p18", 4), ("gray", 24), ("complementary", 5), ("multifrequency", 20)]
+
+
+@pytest.mark.parametrize(("name", "frame"), variants(EXCHANGED, ("complementary", 5)))
 def test_exchanged_frames_are_named(name: str, frame: int) -> None:
     sequence, frames = taken(name)
     order = list(range(len(frames)))
     order[frame], order[frame + 1] = frame + 1, frame
     found = check_description(sequence, frames[order])
     assert found[0].cause == "frame-order"
-    assert re.search(rf"frames {frame + 1} and {frame + 2}\b", found[0].message)
+    assert not missing_facts(found[0].message, f"frames {frame + 1} and {frame + 2}")
 
 
-@pytest.mark.parametrize(("name", "frame"), [("gray", 24), ("complementary", 16), ("white", 3)])
+@pytest.mark.parametrize(
+    ("name", "frame"), variants([("gray", 24), ("complementary", 16), ("white", 3)], ("complementary", 16))
+)
 def test_a_missing_frame_is_named(name: str, frame: int) -> None:
     sequence, frames = taken(name)
     short = np.concatenate([np.delete(frames, frame, axis=0), frames[-1:]])
@@ -128,16 +140,20 @@ def test_a_missing_frame_is_named(name: str, frame: int) -> None:
     assert (found[0].cause, found[0].value) == ("missing-frame", frame)
 
 
-@pytest.mark.parametrize(("name", "frame"), [("gray", 25), ("gray", 26), ("complementary", 7), ("inverses", 14)])
+REPEATED = [("gray", 25), ("gray", 26), ("complementary", 7), ("inverses", 14)]
+
+
+@pytest.mark.parametrize(("name", "frame"), variants(REPEATED, ("complementary", 7)))
 def test_a_repeated_image_is_named(name: str, frame: int) -> None:
     sequence, frames = taken(name)
     repeated = frames.copy()
     repeated[frame] = frames[frame - 1]
     found = check_description(sequence, repeated)
     assert [(c.cause, c.value) for c in found] == [("duplicate-frame", float(frame))]
-    assert re.findall(r"frame (\d+)", found[0].message) == [str(frame + 1), str(frame)]
+    assert not missing_facts(found[0].message, f"frame {frame + 1}", f"frame {frame}")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("frame", [5, 6])
 def test_room_light_among_gray_frames_is_corrected(frame: int) -> None:
     sequence, frames = taken("complementary")
@@ -152,7 +168,7 @@ def test_room_light_among_gray_frames_is_corrected(frame: int) -> None:
         assert 0.01 < np.sqrt(np.nanmean((seen - truth) ** 2)) < 0.08  # px; rounding to 0.7 of the levels
 
 
-@pytest.mark.parametrize("name", ["p18", "gray", "complementary", "three", "white", "inverses"])
+@pytest.mark.parametrize("name", variants([name for name in SEQUENCES if name != "multifrequency"], "three"))
 def test_bits_in_reverse_order_are_named(name: str) -> None:
     sequence, frames = taken(name)
     frames = frames.copy()
@@ -163,7 +179,7 @@ def test_bits_in_reverse_order_are_named(name: str) -> None:
     assert causes(sequence, frames) == [("bit-order", "x"), ("bit-order", "y")]
 
 
-@pytest.mark.parametrize("name", ["gray", "inverses"])
+@pytest.mark.parametrize("name", variants(["gray", "inverses"], "inverses"))
 def test_inverses_taken_for_patterns_are_named(name: str) -> None:
     sequence, frames = taken(name)
     frames = frames.copy()
@@ -172,10 +188,10 @@ def test_inverses_taken_for_patterns_are_named(name: str) -> None:
         frames[pattern + inverse] = frames[inverse + pattern]
     found = check_description(sequence, frames)
     assert [(c.cause, c.axis) for c in found] == [("bit-order", "x"), ("bit-order", "y")]
-    assert all("inverse" in c.message for c in found)
+    assert not any(missing_facts(c.message, "inverse") for c in found)
 
 
-@pytest.mark.parametrize("name", SEQUENCES)
+@pytest.mark.parametrize("name", variants(SEQUENCES, "three"))
 def test_exchanged_axes_are_named(name: str) -> None:
     sequence, frames = taken(name)
     other = {"x": "y", "y": "x", None: None}
@@ -183,8 +199,8 @@ def test_exchanged_axes_are_named(name: str) -> None:
     assert causes(exchanged, frames) == [("axes-swapped", None)]
 
 
-@pytest.mark.parametrize("kinds", [("phase",), ("gray", "complementary")])
-def test_steps_or_bits_of_the_other_axis_are_named(kinds: tuple[str, ...]) -> None:
+@pytest.mark.parametrize("kinds", [["phase"], pytest.param(["gray", "complementary"], marks=pytest.mark.slow)])
+def test_steps_or_bits_of_the_other_axis_are_named(kinds: list[str]) -> None:
     sequence, frames = taken("complementary")
     x, y = ([i for i, f in enumerate(sequence.frames) if f.axis == axis and f.kind in kinds] for axis in AXES)
     order = np.arange(len(frames))
@@ -192,6 +208,7 @@ def test_steps_or_bits_of_the_other_axis_are_named(kinds: tuple[str, ...]) -> No
     assert causes(sequence, frames[order])[0][0] == "axes-swapped"
 
 
+@pytest.mark.slow
 def test_bits_in_reverse_order_after_the_complementary_one_are_named() -> None:
     sequence, frames = taken("complementary")
     order = np.arange(len(frames))
@@ -201,6 +218,7 @@ def test_bits_in_reverse_order_after_the_complementary_one_are_named() -> None:
     assert causes(sequence, frames[order]) == [("bit-order", "x"), ("bit-order", "y")]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("steps", [[*range(0, 18, 2), *range(1, 18, 2)], [k // 2 + 9 * (k % 2) for k in range(18)]])
 def test_all_steps_in_another_order_are_named(steps: list[int]) -> None:
     sequence, frames = taken("p18")
@@ -209,40 +227,43 @@ def test_all_steps_in_another_order_are_named(steps: list[int]) -> None:
     order[places] = places[steps]
     (contradiction,) = check_description(sequence, frames[order])
     assert (contradiction.cause, contradiction.axis) == ("step-order", "y")
-    assert ", ".join(map(str, steps)) in contradiction.message
+    assert not missing_facts(contradiction.message, ", ".join(map(str, steps)))
 
 
+@pytest.mark.slow
 def test_a_lamp_that_saturates_the_later_frames_is_named() -> None:
     sequence, frames = taken("p18")
     lamp = np.where(np.arange(len(frames)) >= 20, 170, 0)[:, None, None]
     switched_on = np.clip(frames.astype(int) + lamp, 0, 255).astype(np.uint8)
     (contradiction,) = check_description(sequence, switched_on)
-    assert contradiction.cause == "room-light" and "frame 21 " in contradiction.message
+    assert (contradiction.cause, contradiction.value) == ("room-light", 20.0)
+    assert not missing_facts(contradiction.message, "frame 21")
 
 
-@pytest.mark.parametrize("name", ["p18", "complementary", "three", "inverses"])
+@pytest.mark.parametrize("name", variants(STEPS_AND_CODE, "three"))
 def test_the_sign_of_one_axis_is_named(name: str) -> None:
     sequence, frames = taken(name)
     found = check_description(replace(sequence, phase_sign=PerAxis(1, -1)), frames)
     assert [(c.cause, c.axis, c.value) for c in found] == [("step-order", "y", 1.0)]
 
 
+@pytest.mark.slow
 def test_the_sign_of_one_axis_mirrors_a_phase_without_code() -> None:
     sequence, frames = taken("multifrequency")
     found = check_description(replace(sequence, phase_sign=PerAxis(-1, 1)), frames)
     assert (found[0].cause, found[0].axis, found[0].value) == ("step-order", "x", 1.0)
 
 
-@pytest.mark.parametrize("name", ["p18", "complementary", "three", "inverses"])
+@pytest.mark.parametrize("name", variants(STEPS_AND_CODE, "three"))
 def test_steps_in_reverse_order_are_named(name: str) -> None:
     sequence, frames = taken(name)
     steps = tuple(replace(f, step=f.steps - 1 - f.step) if f.kind == "phase" else f for f in sequence.frames)
     found = check_description(replace(sequence, frames=steps), frames)
     assert [(c.cause, c.axis) for c in found] == [("step-order", "x"), ("step-order", "y")]
-    assert all("reverse order" in c.message for c in found)
+    assert not any(missing_facts(c.message, "reverse") for c in found)
 
 
-@pytest.mark.parametrize("name", ["p18", "complementary", "three"])
+@pytest.mark.parametrize("name", variants(["p18", "complementary", "three"], "three"))
 @pytest.mark.parametrize("turns", [0.25, 0.5])
 def test_a_stated_origin_is_compared_with_the_fringes(name: str, turns: float) -> None:
     sequence, frames = taken(name)
@@ -263,7 +284,10 @@ def test_steps_that_begin_later_are_named_with_the_offset() -> None:
     assert found[0].value == pytest.approx(np.pi / 2, abs=0.03)
 
 
-@pytest.mark.parametrize(("name", "cell"), [("p18", 16.0), ("p18", 36.0), ("three", 20.25), ("complementary", 27.0)])
+CELLS = [("p18", 16.0), ("p18", 36.0), ("three", 20.25), ("complementary", 27.0)]
+
+
+@pytest.mark.parametrize(("name", "cell"), variants(CELLS, ("three", 20.25)))
 def test_cells_unlike_the_fringes_are_named(name: str, cell: float) -> None:
     """The frames' cells are as wide as their period; described is a period for which they would not be."""
     sequence, frames = taken(name)
@@ -275,7 +299,7 @@ def test_cells_unlike_the_fringes_are_named(name: str, cell: float) -> None:
     assert found[0].value == pytest.approx(true**2 / cell, rel=0.003)
 
 
-@pytest.mark.parametrize("name", ["gray", "p18", "multifrequency"])
+@pytest.mark.parametrize("name", variants(["gray", "p18", "multifrequency", "three"], "three"))
 def test_a_projector_that_is_too_small_is_named(name: str) -> None:
     sequence, frames = taken(name)
     found = check_description(replace(sequence, projector_size=(600, 1140)), frames)
@@ -292,10 +316,10 @@ def test_a_projector_that_is_too_small_is_named(name: str) -> None:
     ],
 )
 def test_frames_without_a_pattern_are_named(spoil: Callable[[np.ndarray], np.ndarray], cause: str) -> None:
-    sequence, frames = taken("p18")
+    sequence, frames = taken("three")
     found = check_description(sequence, spoil(frames))
     assert [c.cause for c in found] == [cause]
-    assert "0.0 %" in found[0].message
+    assert not missing_facts(found[0].message, "0.0 %")
 
 
 def test_a_dim_wall_does_not_decide() -> None:
@@ -306,6 +330,7 @@ def test_a_dim_wall_does_not_decide() -> None:
     assert causes(sequence, both) == []
 
 
+@pytest.mark.slow
 def test_frames_of_no_pattern_that_was_described_are_unreadable() -> None:
     sequence, frames = taken("complementary")
     order = np.random.default_rng(3).permutation(len(frames))

@@ -2,12 +2,14 @@
 
 import numpy as np
 import pytest
-from fringe_scene import capture, slope
+from fringe_scene import capture, slope, variants
 
 from slviewer.fringe.decode import decode, decode_reference, pack_shifts
 from slviewer.fringe.layout import axis_layout
 from slviewer.fringe.presets import complementary, gray, multifrequency, p18, phase_steps
 from slviewer.fringe.sequence import PatternSequence
+
+pytestmark = pytest.mark.computes
 
 PROJECTOR = (912, 1140)
 SEQUENCES = {
@@ -40,16 +42,16 @@ def assert_same(sequence, frames, axis):
     np.testing.assert_allclose(fast.background, definition.background, rtol=1e-5, atol=1e-4)
 
 
+LIGHTS = [
+    {"read": 1.0},
+    {"gain": 50, "read": 3.0},
+    {"defocus": 4.0, "psf": 1.5, "read": 2.0, "gamma": 2.2, "gain": 220},
+    {"gain": 290, "shot": 0.05},
+]
+
+
 @pytest.mark.parametrize("name", SEQUENCES)
-@pytest.mark.parametrize(
-    "light",
-    [
-        {"read": 1.0},
-        {"gain": 50, "read": 3.0},
-        {"defocus": 4.0, "psf": 1.5, "read": 2.0, "gamma": 2.2, "gain": 220},
-        {"gain": 290, "shot": 0.05},
-    ],
-)
+@pytest.mark.parametrize("light", variants(LIGHTS, LIGHTS[2]))
 def test_on_scenes_with_a_depth_step(name, light):
     sequence = SEQUENCES[name]
     assert_same(sequence, capture(sequence, step(), **light), "x")
@@ -61,9 +63,16 @@ def test_on_random_and_flat_frames(name):
     rng = np.random.default_rng(2)
     n = len(sequence.frames)
     assert_same(sequence, rng.integers(0, 256, (n, 23, 31)).astype(np.uint8), "x")
-    assert_same(sequence, rng.integers(0, 4096, (n, 23, 31)).astype(np.uint16), "y")
     assert_same(sequence, np.zeros((n, 5, 7), np.uint8), "x")
     assert_same(sequence, np.full((n, 3, 1), 255, np.uint8), "y")
+
+
+@pytest.mark.parametrize("name", variants(SEQUENCES, "p18", "complementary"))  # one kernel; the others take as long
+def test_on_random_frames_of_more_bits(name):
+    """The kernels are compiled for uint16 as well."""
+    sequence = SEQUENCES[name]
+    frames = np.random.default_rng(2).integers(0, 4096, (len(sequence.frames), 23, 31)).astype(np.uint16)
+    assert_same(sequence, frames, "y")
 
 
 def test_on_frames_that_are_no_contiguous_array():

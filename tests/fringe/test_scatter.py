@@ -3,11 +3,13 @@
 import cv2
 import numpy as np
 import pytest
+from fringe_scene import capture, slope, variants
 
 from slviewer.fringe.decode import decode, decode_reference
 from slviewer.fringe.presets import complementary
 from slviewer.fringe.scatter import BLOCKINESS, SIGNIFICANT, measure_scatter
-from tests.fringe.fringe_scene import capture, slope
+
+pytestmark = pytest.mark.computes
 
 SEQUENCE = complementary((256, 64))
 SHAPE = (176, 240)
@@ -30,7 +32,7 @@ def scatter_over_sigma(phase):
     return float(np.sqrt(np.mean(np.sort(z**2)[: int(0.99 * len(z))])))
 
 
-@pytest.mark.parametrize("quality", [85, 65, 50])
+@pytest.mark.parametrize("quality", variants([85, 65, 50], 65))
 def test_sigma_holds_for_compressed_frames(quality):
     phase = decode(SEQUENCE, jpeg(frames_of(), quality), "x")
     assert measure_scatter(phase).is_compressed

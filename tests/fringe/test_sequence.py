@@ -3,6 +3,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from facts import raises
 
 from slviewer.errors import InputError
 from slviewer.fringe.patterns import profile, render
@@ -59,21 +60,21 @@ def _frames(sequence, *without):
 
 
 @pytest.mark.parametrize(
-    ("frames", "said"),
+    ("frames", "facts"),
     [
-        (_frames(p18((912, 1140)), 3), "phase step 3 of 18 is missing"),
-        (_frames(p18((912, 1140)), 24), "Gray bit 6 of 7 is missing"),
-        (_frames(p18((912, 1140)), 18, 20), "Gray bit 0, 2 of 7 is missing"),
-        (_frames(gray((64, 64)), 3), "inverse of Gray bit 1 of 6 is missing"),
-        ((*p18((912, 1140)).frames, p18((912, 1140)).frames[0]), "step 0 occurs more than once"),
+        (_frames(p18((912, 1140)), 3), ("phase step 3 of 18", "missing")),
+        (_frames(p18((912, 1140)), 24), ("Gray bit 6 of 7", "missing")),
+        (_frames(p18((912, 1140)), 18, 20), ("Gray bit 0, 2 of 7", "missing")),
+        (_frames(gray((64, 64)), 3), ("inverse", "Gray bit 1 of 6", "missing")),
+        ((*p18((912, 1140)).frames, p18((912, 1140)).frames[0]), ("step 0", "more than once")),
         (
             (*_frames(p18((912, 1140)), 0), Frame("phase", "x", step=0, steps=17, period_px=18)),
-            "speak of 17, 18 phase steps",
+            ("17, 18 phase steps",),
         ),
     ],
 )
-def test_an_incomplete_sequence_is_refused(frames, said):
-    with pytest.raises(InputError, match=said):
+def test_an_incomplete_sequence_is_refused(frames, facts):
+    with raises(InputError, *facts):
         PatternSequence((912, 1140), frames)
 
 
@@ -106,7 +107,7 @@ def test_a_frame_that_cannot_be_is_refused(data):
 def test_sizes():
     assert parse_size("912x1140") == parse_size([912, 1140]) == (912, 1140)
     for bad in ("912", "912x", "0x4", "axb", None):
-        with pytest.raises(InputError, match="width and height in px"):
+        with raises(InputError, f"'{bad}'", "width and height"):
             parse_size(bad)
 
 
@@ -149,28 +150,28 @@ def test_descriptions_written_before_read_the_same_and_stay_as_they_are():
 def test_a_sequence_without_a_projector_size():
     sequence = PatternSequence(None, multifrequency((912, 1140)).frames, relative=True)
     assert _through_json(sequence) == sequence and "projector" not in sequence.to_dict()
-    with pytest.raises(InputError, match="projector"):
+    with raises(InputError, "projector"):
         _ = sequence.projector
-    with pytest.raises(InputError, match="projector"):
+    with raises(InputError, "projector"):
         render(sequence, 0)
 
 
 @pytest.mark.parametrize(
-    ("entry", "said"),
+    ("entry", "facts"),
     [
-        ({"phase_sign": 2}, "phase_sign is 2"),
-        ({"phase_sign": {"x": 1, "y": 0}}, "phase_sign is 0"),
-        ({"phase_sign": {"x": 1, "z": 1}}, "unknown entry 'z'"),
-        ({"phase_offset": "quarter"}, "phase_offset must be a number"),
-        ({"phase_offset": float("nan")}, "is nan rad"),
-        ({"gray_cell_px": 0}, "Gray cell of 0"),
-        ({"gray_cell_px": {"x": -2}}, "axis x: a Gray cell of -2"),
-        ({"gray_origin": []}, "gray_origin must be a number"),
-        ({"relative": 1}, "relative is 1"),
+        ({"phase_sign": 2}, ("phase_sign", 2)),
+        ({"phase_sign": {"x": 1, "y": 0}}, ("phase_sign", 0)),
+        ({"phase_sign": {"x": 1, "z": 1}}, ("phase_sign", "'z'")),
+        ({"phase_offset": "quarter"}, ("phase_offset", "number")),
+        ({"phase_offset": float("nan")}, ("phase_offset", "nan rad")),
+        ({"gray_cell_px": 0}, ("Gray cell", "0.0 px")),
+        ({"gray_cell_px": {"x": -2}}, ("axis x", "Gray cell", "-2.0 px")),
+        ({"gray_origin": []}, ("gray_origin", "number")),
+        ({"relative": 1}, ("relative", 1)),
     ],
 )
-def test_conventions_that_cannot_be_are_refused(entry, said):
-    with pytest.raises(InputError, match=said):
+def test_conventions_that_cannot_be_are_refused(entry, facts):
+    with raises(InputError, *facts):
         PatternSequence.from_dict({**p18((912, 1140)).to_dict(), **entry})
 
 

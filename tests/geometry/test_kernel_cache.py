@@ -56,6 +56,7 @@ def read_only(install: Path) -> None:
     (install / "slviewer" / "__pycache__").touch()
 
 
+@pytest.mark.process
 @pytest.mark.computes
 def test_another_files_change_is_seen_and_code_is_compiled_once(install: Path, tmp_path: Path) -> None:
     home = {"HOME": str(tmp_path / "home")}
@@ -69,6 +70,8 @@ def test_another_files_change_is_seen_and_code_is_compiled_once(install: Path, t
     assert (value, hits) == ("10", "1")
 
 
+@pytest.mark.slow
+@pytest.mark.process
 @pytest.mark.computes
 def test_of_two_processes_one_compiles_and_the_other_waits_and_loads(install: Path) -> None:
     with ThreadPoolExecutor(2) as both:
@@ -79,6 +82,7 @@ def test_of_two_processes_one_compiles_and_the_other_waits_and_loads(install: Pa
 PLACE = "from slviewer.geometry.jit_cache import cache_folder; print(cache_folder('slviewer.caller'))"
 
 
+@pytest.mark.process
 def test_places_are_tried_in_turn_and_old_code_goes(install: Path, tmp_path: Path) -> None:
     given, temp, wall = tmp_path / "given", tmp_path / "temp", tmp_path / "wall"
     temp.mkdir()
@@ -94,6 +98,7 @@ def test_places_are_tried_in_turn_and_old_code_goes(install: Path, tmp_path: Pat
     assert Path(third).parent.stat().st_mode & 0o777 == 0o700
 
 
+@pytest.mark.process
 def test_a_folder_that_others_may_write_to_is_not_read(install: Path, tmp_path: Path) -> None:
     read_only(install)
     temp, wall = tmp_path / "temp", tmp_path / "wall"
@@ -104,6 +109,7 @@ def test_a_folder_that_others_may_write_to_is_not_read(install: Path, tmp_path: 
     assert run(install, PLACE, HOME=str(wall), TMPDIR=str(temp)) == ["None"]
 
 
+@pytest.mark.process
 def test_where_no_place_is_left_none_is_named(install: Path, tmp_path: Path) -> None:
     read_only(install)
     (tmp_path / "wall").touch()

@@ -1,10 +1,12 @@
 """What the second axis of a capture says of the calibration: nothing, a raised sigma, or why they do not belong."""
 
+import re
 from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
+from facts import missing_facts, raises
 
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import InputError
@@ -12,6 +14,8 @@ from slviewer.fringe.phase import PhaseMap
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.rig import StereoRig
 from slviewer.reconstruction.axis_agreement import check_phases, check_sizes, measure_agreement
+
+pytestmark = pytest.mark.computes
 
 SIZE, PROJECTOR, PERIOD = (160, 120), (912, 1140), 18.0
 SIGMA_PX = 0.03
@@ -90,30 +94,31 @@ WRONG = {
 
 @pytest.mark.parametrize("reason", WRONG)
 def test_coordinates_of_another_projector_image_are_refused_for_that_reason(reason: str) -> None:
-    with pytest.raises(InputError, match=rf"^scan: .* disagree by \d+\.\d px .*{reason}"):
+    with raises(InputError, "scan", reason) as caught:
         check_phases("scan", phases(WRONG[reason](coordinates(rig()))), by(rig()), CALIBRATED)
+    assert re.search(r"\d+\.\d px", str(caught.value))
 
 
 def test_an_inverted_transform_and_exchanged_matrices_are_named() -> None:
     true, found = rig(), phases(coordinates(rig()))
     inverted = StereoRig(true.camera, true.projector, true.R.T, -true.R.T @ true.t)
-    with pytest.raises(InputError, match="R and T"):
+    with raises(InputError, "R and T"):
         check_phases("scan", found, by(inverted))
     exchanged = StereoRig(
         Lens(true.projector.K, true.projector.D, SIZE), Lens(true.camera.K, true.camera.D, PROJECTOR), true.R, true.t
     )
-    with pytest.raises(InputError, match="camera and projector"):
+    with raises(InputError, "camera and projector"):
         check_phases("scan", found, by(exchanged))
 
 
 def test_a_rig_that_was_moved_is_refused_or_raises_sigma() -> None:
     true, found = rig(), phases(coordinates(rig()))
-    with pytest.raises(InputError, match="rig"):
+    with raises(InputError, "rig"):
         check_phases("scan", found, by(turned(true, (3.0, 0, 0))))
     accepted = check_phases("scan", found, by(turned(true, (3.0, 0, 0))), accept=True)
     assert accepted.warnings and accepted.sigma_factor > 100
     little = check_phases("scan", found, by(turned(true, (0.1, 0, 0))))  # 0.28 px in the rows
-    assert 6 < little.sigma_factor < 15 and "uncertainty" in little.warnings[0]
+    assert 6 < little.sigma_factor < 15 and not missing_facts(little.warnings[0], "uncertainty")
 
 
 def test_residuals_of_the_calibration_are_no_contradiction() -> None:
@@ -127,18 +132,18 @@ def test_one_axis_is_judged_by_what_the_projector_could_light_and_by_depth() -> 
     true, found = rig(), coordinates(rig())
     for axis in "xy":
         assert check_phases("scan", phases(found, axis), by(true), CALIBRATED).warnings == ()
-    with pytest.raises(InputError, match=r"\d+ %"):
+    with raises(InputError, "scan", "100 %"):
         check_phases("scan", phases((found + 0.5) / 2 - 0.5, "y"), by(true), CALIBRATED)
     (warning,) = check_phases("scan", phases((found + 0.5) / 3 - 0.5, "x"), by(true), CALIBRATED).warnings
-    assert "350 mm" in warning and "980 mm" in warning
+    assert not missing_facts(warning, "350 mm", "980 mm")
 
 
 def test_sizes_are_named_and_their_ratio() -> None:
     check_sizes("scan", SIZE, PROJECTOR, rig())
     check_sizes("scan", SIZE, None, rig())  # not known
-    with pytest.raises(InputError, match=r"456x570 .*912x1140"):
+    with raises(InputError, "456x570", "912x1140"):
         check_sizes("scan", SIZE, (456, 570), rig())
-    with pytest.raises(InputError, match=r"150x120 .*160x120"):
+    with raises(InputError, "150x120", "160x120"):
         check_sizes("scan", (150, 120), PROJECTOR, rig())
 
 
@@ -155,4 +160,4 @@ def test_light_by_another_path_raises_sigma_where_it_falls() -> None:
     assert (excess[:9] == 0).all() and (excess[9:][illuminated[9:]] > 0).mean() > 0.9
     assert 0.1 < np.median(excess[excess > 0]) < 0.4
     (warning,) = check.warnings
-    assert warning.startswith("scan: ") and "reflections" in warning
+    assert warning.startswith("scan: ") and not missing_facts(warning, "reflections")

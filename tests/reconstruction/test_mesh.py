@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from facts import raises
 
 from slviewer.errors import InputError
 from slviewer.reconstruction.mesh import triangulate_grid
@@ -58,7 +59,7 @@ def test_a_ridge_is_cut_along_itself() -> None:
 
 
 def test_bad_input_is_refused() -> None:
-    with pytest.raises(InputError, match="organised"):
+    with raises(InputError, "organised", "(10, 3)"):
         triangulate_grid(np.zeros((10, 3)), 1.0)
-    with pytest.raises(InputError, match="positive"):
+    with raises(InputError, "0.0 mm", "positive"):
         triangulate_grid(grid(), 0.0)

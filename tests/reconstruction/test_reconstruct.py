@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from facts import raises
 
 from slviewer.errors import InputError
 from slviewer.reconstruction.cloud import Cloud
@@ -103,11 +104,11 @@ def test_blur_at_edges_masks_a_pixel_or_adds_to_its_uncertainty() -> None:
 
 
 def test_missing_axes_are_named() -> None:
-    with pytest.raises(InputError, match=r"axis y.*\bx\b"):
+    with raises(InputError, "axis y", "x"):
         reconstruct(FakeModel({"x": 1, "y": 1}), phases("x"), axis="y")
-    with pytest.raises(InputError, match=r"fake.*axis y.*\bx\b"):
+    with raises(InputError, "fake", "axis y", "x"):
         reconstruct(FakeModel({"x": 1}), phases("x", "y"), axis="y")
-    with pytest.raises(InputError, match=r"axis y.*fake.*\bx\b"):
+    with raises(InputError, "axis y", "fake", "x"):
         reconstruct(FakeModel({"x": 1}), phases("y"))
 
 
@@ -124,14 +125,15 @@ def test_cloud_and_its_texture() -> None:
     for bits in (8, 10, 12, 14, 16):
         deep = np.full(SHAPE, 3 * 2 ** (bits - 2), np.uint16)  # three quarters of the range
         assert (Cloud(points, "x", "stereo", sigma, deep).texture == 192).all()
-    with pytest.raises(InputError, match="capture"):
+    with raises(InputError, "capture"):
         Cloud(points, "x", "stereo", sigma, texture[1:])
-    with pytest.raises(InputError, match="float64"):
+    with raises(InputError, "float64"):
         Cloud(points, "x", "stereo", sigma, sigma)
     with pytest.raises(InputError):
         Cloud(points, "x", "stereo", sigma[1:])
 
 
+@pytest.mark.computes
 def test_normals_of_a_plane() -> None:
     points = plane_grid((60, 80))
     truth = np.array([0.3, -0.2, -1]) / np.linalg.norm([0.3, -0.2, -1])
@@ -146,6 +148,7 @@ def test_normals_of_a_plane() -> None:
     assert tilt[1] > 2 * tilt[2]
 
 
+@pytest.mark.computes
 def test_normals_with_gaps_and_jumps() -> None:
     truth = np.array([0.3, -0.2, -1]) / np.linalg.norm([0.3, -0.2, -1])
     points = plane_grid((60, 80))
@@ -161,5 +164,5 @@ def test_normals_with_gaps_and_jumps() -> None:
     lonely[4] = [0, 0, 500]  # one row says nothing about the other direction
     lonely[4, :, 0] = np.arange(9)
     assert np.isnan(normals(lonely)).all()
-    with pytest.raises(InputError, match="organised"):
+    with raises(InputError, "organised", "(4800, 3)"):
         normals(points.reshape(-1, 3))

@@ -35,6 +35,7 @@ def test_the_exponent_of_the_growth_is_stated_beside_the_last_size() -> None:
 
 
 @pytest.mark.computes
+@pytest.mark.slow
 def test_pixels_captures_and_scans_are_measured() -> None:
     rig = letter(0.15)
     scene = letter_plan(rig, poses=1)["pose_01"]
