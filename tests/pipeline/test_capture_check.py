@@ -10,6 +10,7 @@ from facts import raises
 from slviewer.errors import InputError
 from slviewer.fringe.phase import PhaseMap, Reason
 from slviewer.fringe.presets import p18
+from slviewer.fringe.sequence import one_axis
 from slviewer.pipeline.capture_phases import check_capture, decode_frames
 from slviewer.pipeline.frame_check import FrameCheck, check_frames
 from slviewer.simulation.boards import Pose, blank_board
@@ -17,7 +18,7 @@ from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import letter
 
 PROJECTOR = (912, 1140)
-SEQUENCE = p18(PROJECTOR)
+SEQUENCE = one_axis(p18(PROJECTOR), "x")
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ from artefact_places import bar_places
 from facts import missing_facts, raises
 
 from slviewer.errors import InputError
-from slviewer.fringe.presets import p18
+from slviewer.fringe.presets import complementary, p18
 from slviewer.fringe.sequence import one_axis
 from slviewer.pipeline.accept import accept
 from slviewer.pipeline.check import REFERENCE, check, load_drift_history
@@ -53,7 +53,7 @@ spacing_mm = {limit}
 def measured(tmp_path_factory) -> Path:
     """A session whose imported calibration is the truth, with seven bars and four captures of the first one."""
     folder = tmp_path_factory.mktemp("accept") / "session"
-    rig = letter(0.25, seed=2, local_distortion_px=0)
+    rig = letter(0.15, seed=2, local_distortion_px=0)
     sequence = one_axis(p18(rig.projector.size), "x")
     with Session.create(folder) as store:
         save_true_stereo(store, rig)
@@ -116,7 +116,7 @@ def calibrated(recorded: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
     rig = letter(0.25)  # the recorded one
     turn = rotation(np.array([0.0, 2e-4, 0.0]))
     panned = replace(rig, R=turn @ rig.R, t=turn @ rig.t)
-    both = p18(rig.projector.size)
+    both = complementary(rig.projector.size)
     later = target_poses(replace(rig, seed=6), BOARD, 3)
     with Session.open(folder, write=True) as store:
         for name, moved, sequence in (

@@ -136,6 +136,7 @@ def test_a_merge_and_one_surface_through_it(kept: Path, tmp_path: Path) -> None:
     assert np.median(off) < 0.3 and off.max() < 10  # beyond the limb, which so few pixels show, it is cut a little late
 
 
+@pytest.mark.process  # which reads a storage of OpenCV
 @pytest.mark.parametrize("suffix", formats("calibration"))
 def test_a_calibration_comes_back(kept: Path, tmp_path: Path, suffix: str) -> None:
     path = export(kept, "calibration", out=tmp_path / f"c.{suffix}").path

@@ -14,7 +14,7 @@ from slviewer.geometry.rig import StereoRig
 from slviewer.session.exporters import write_calibration
 from slviewer.session.store import Session
 
-pytestmark = pytest.mark.computes
+pytestmark = [pytest.mark.computes, pytest.mark.process]  # a process reads each storage of OpenCV
 
 Run = Callable[..., tuple[int, str, str]]
 CAMERA, PROJECTOR = (160, 120), (456, 570)

@@ -55,6 +55,7 @@ def unchanged(err: str) -> set[str]:
     return set(re.findall(r"capture_\d", warning))
 
 
+@pytest.mark.computes
 def test_an_import_that_is_repeated_adds_what_is_missing(run: Run, tmp_path: Path) -> None:
     write_captures(tmp_path / "source", 3)
     session, options = tmp_path / "session", ("--projector", "120x90")
@@ -88,6 +89,7 @@ def faulty(tmp_path: Path) -> Path:
     return tmp_path / "source"
 
 
+@pytest.mark.computes
 def test_readable_captures_are_imported_and_the_others_named(faulty: Path, run: Run, tmp_path: Path) -> None:
     session = tmp_path / "session"
     status, out, err = run("import", "procam-calibration", faulty, session, "--projector", "120x90")

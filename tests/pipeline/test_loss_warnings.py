@@ -14,6 +14,8 @@ from slviewer.simulation.boards import Pose, blank_board
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import letter
 
+pytestmark = pytest.mark.computes
+
 PLANE = blank_board(Pose(np.eye(3), np.array([0.0, 0.0, 600.0])))
 
 

@@ -88,6 +88,7 @@ def test_scans_without_markers_are_refused_with_what_to_do(tmp_path: Path) -> No
 
 
 @pytest.mark.computes
+@pytest.mark.slow
 def test_the_mat_on_a_turntable_gives_its_axis(tmp_path: Path) -> None:
     """A plate with markers, turned in steps that are stated 1 degree too small."""
     session = tmp_path / "session"

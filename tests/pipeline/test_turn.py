@@ -38,6 +38,7 @@ def calibrated(folder: Path, scale: float = SCALE) -> Path:
 
 
 @pytest.mark.computes
+@pytest.mark.slow
 def test_one_command_makes_a_watertight_mesh_of_a_turned_object(tmp_path: Path, run: Callable[..., Any]) -> None:
     session, rig, out = calibrated(tmp_path / "session"), tmp_path / "rig.toml", tmp_path / "stone.ply"
     rig.write_text(to_toml(RIG))
