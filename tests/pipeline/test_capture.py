@@ -124,6 +124,7 @@ def test_capture_refuses_wrong_arguments_and_leaves_nothing(run: Run, tmp_path: 
     assert not (tmp_path / "session").exists()
 
 
+@pytest.mark.computes
 def test_a_capture_that_is_cancelled_leaves_nothing(tmp_path: Path):
     def stop(share: float, doing: str) -> None:
         if "frame 9 of" in doing:

@@ -107,6 +107,7 @@ class SizeInAList(Camera):
     size = [64, 48]  # type: ignore[assignment]  # noqa: RUF012
 
 
+@pytest.mark.computes
 def test_a_good_camera_has_no_fault():
     assert check_camera(Camera()) == []
     rig = simulated_rig(SimulatedWorld(letter(0.1)))
@@ -177,6 +178,7 @@ def rendered(tmp_path: Path) -> Path:
     return folder
 
 
+@pytest.mark.computes
 @pytest.mark.parametrize(
     ("wrong", "named"),
     [

@@ -32,6 +32,7 @@ def photographs(tmp_path: Path) -> Path:
     return folder
 
 
+@pytest.mark.computes
 def test_one_photograph_gives_a_table_and_an_overlay(photographs: Path, tmp_path: Path, capsys) -> None:
     overlay, table = tmp_path / "out" / "overlay.png", tmp_path / "out" / "corners.csv"
     image = str(photographs / "board.png")
@@ -52,6 +53,7 @@ def test_one_photograph_gives_a_table_and_an_overlay(photographs: Path, tmp_path
     assert np.ptp(picture.astype(int), axis=2).max() > 100 and plain.ndim == 2
 
 
+@pytest.mark.computes
 def test_several_photographs_give_a_line_each_and_status_1(photographs: Path, tmp_path: Path, capsys) -> None:
     overlays = tmp_path / "overlays"
     assert main(["detect", str(photographs), "--target", str(BOARD), "--out", str(overlays)]) == 1
@@ -73,6 +75,7 @@ def test_what_is_no_photograph_is_named(tmp_path: Path) -> None:
     assert result.to_json()["images"][0]["detected"] is False
 
 
+@pytest.mark.computes
 def test_corners_that_are_seen_of_a_charuco_board_keep_their_numbers(tmp_path: Path) -> None:
     board = Board.parse("charuco:7x5:20")
     view = View(size=(400, 300), supersample=4, fill=0.6, hide=(-30, -30, 30, 90))

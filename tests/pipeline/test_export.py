@@ -104,6 +104,7 @@ def kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.computes
 def test_a_cloud_and_a_mesh_of_a_scan(kept: Path, tmp_path: Path) -> None:
     found = export(kept, "cloud", "scan_01", out=tmp_path / "a.ply")
     ply, measured = read_ply(found.path), np.isfinite(seen()[..., 2])
@@ -124,6 +125,7 @@ def test_a_cloud_and_a_mesh_of_a_scan(kept: Path, tmp_path: Path) -> None:
     assert len(np.unique(mesh.faces)) == len(mesh.vertices)
 
 
+@pytest.mark.computes
 def test_a_merge_and_one_surface_through_it(kept: Path, tmp_path: Path) -> None:
     points = export(kept, "merge", out=tmp_path, file_format="xyz")
     assert points.path.name == "merged_1.xyz"
@@ -186,6 +188,7 @@ def test_the_table_of_verifications(kept: Path, tmp_path: Path) -> None:
     assert rows[0]["up_to_date"] == "yes"
 
 
+@pytest.mark.computes
 def test_the_command_says_what_it_wrote(kept: Path, run: Run, tmp_path: Path) -> None:
     status, said, _ = run("export", kept, "mesh", "scan_02", "--out", tmp_path, "--format", "obj")
     assert status == 0 and not missing_facts(said, "scan_02_mesh.obj", "mm", "colours")
@@ -202,6 +205,7 @@ def test_the_command_says_what_it_wrote(kept: Path, run: Run, tmp_path: Path) ->
     assert [entry.name for entry in tmp_path.iterdir()] == ["scan_02_mesh.obj"]
 
 
+@pytest.mark.computes
 def test_a_mesh_is_made_as_planned_and_says_what_that_did(kept: Path, run: Run, tmp_path: Path) -> None:
     planned = ("--triangles", 500, "--smooth", 2, "--fill-holes", 0)
     status, said, _ = run("export", kept, "mesh", "scan_01", "--out", tmp_path / "m.ply", *planned)
@@ -220,6 +224,7 @@ def test_a_file_that_cannot_be_written_is_told_before_the_work(tmp_path: Path) -
         compare(tmp_path / "nowhere", "a", tmp_path / "nominal.stl", out=tmp_path / "d.stl")
 
 
+@pytest.mark.computes
 def test_a_cancelled_export_leaves_nothing(kept: Path, tmp_path: Path) -> None:
     def stop(done: float, doing: str) -> None:
         if done > 0.5:

@@ -197,6 +197,7 @@ def _toml(frame: Frame) -> str:
     return "".join(f"{key} = {value!r}\n" for key, value in frame.to_dict().items())
 
 
+@pytest.mark.computes
 def test_a_description_states_the_full_scale(tmp_path: Path) -> None:
     warnings: list[str] = []
     source = write_frames(tmp_path / "a", head="full_scale = 4095\n")
@@ -210,6 +211,7 @@ def test_a_description_states_the_full_scale(tmp_path: Path) -> None:
         import_captures(source, tmp_path / "s")
 
 
+@pytest.mark.computes
 def test_messages_name_the_files_of_frames(tmp_path: Path) -> None:
     count = len(gray((120, 90)).frames)
     order = [*range(3), 4, 3, *range(5, count)]

@@ -25,6 +25,8 @@ from slviewer.session.importers.imported import (
 from slviewer.session.importers.layouts import BUILT_IN
 from slviewer.session.store import Session
 
+pytestmark = pytest.mark.computes
+
 Run = Callable[..., tuple[int, str, str]]
 PROJECTOR = (120, 90)
 
@@ -55,7 +57,6 @@ def unchanged(err: str) -> set[str]:
     return set(re.findall(r"capture_\d", warning))
 
 
-@pytest.mark.computes
 def test_an_import_that_is_repeated_adds_what_is_missing(run: Run, tmp_path: Path) -> None:
     write_captures(tmp_path / "source", 3)
     session, options = tmp_path / "session", ("--projector", "120x90")
@@ -89,7 +90,6 @@ def faulty(tmp_path: Path) -> Path:
     return tmp_path / "source"
 
 
-@pytest.mark.computes
 def test_readable_captures_are_imported_and_the_others_named(faulty: Path, run: Run, tmp_path: Path) -> None:
     session = tmp_path / "session"
     status, out, err = run("import", "procam-calibration", faulty, session, "--projector", "120x90")
@@ -141,7 +141,6 @@ def write_colour(source: Path, exposures: tuple[float, ...] = ()) -> Path:
     return source
 
 
-@pytest.mark.computes
 def test_the_default_channel_of_colour_frames_is_stated_once(run: Run, tmp_path: Path) -> None:
     source, session = write_colour(tmp_path / "source"), tmp_path / "session"
     shutil.copytree(source / "scan", source / "scan_2")

@@ -23,6 +23,7 @@ from slviewer.validation.bench_live import true_calibration
 from slviewer.wizard.result_views import merge_view
 
 
+@pytest.mark.process  # which Open3D starts while it is imported
 def test_starts_that_do_not_fit_together_are_refused_at_once(tmp_path) -> None:
     out = tmp_path / "merged.ply"
     with raises(UsageError, "angle"):

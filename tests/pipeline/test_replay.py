@@ -60,6 +60,7 @@ def test_one_capture_is_played_again_and_again(recorded: Path):
         reel(recorded, capture="scan_3")
 
 
+@pytest.mark.computes
 def test_a_folder_of_images_is_played_by_its_toml(tmp_path: Path):
     write_pattern_folder(tmp_path / "patterns", SEQUENCE)
     toml = tmp_path / "patterns" / "sequence.toml"
@@ -88,6 +89,7 @@ def test_folders_that_hold_nothing_are_refused(tmp_path: Path, recorded: Path):
         reel(tmp_path / "empty")
 
 
+@pytest.mark.computes
 def test_the_wizard_captures_what_is_played(recorded: Path, tmp_path: Path):
     with Operator(tmp_path / "session", {"driver": "replay", "source": str(recorded)}) as operator:
         assert operator.wait_for(lambda s: s.rig.state == "open", 120.0) is not None
