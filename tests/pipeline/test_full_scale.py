@@ -131,9 +131,9 @@ def test_pixels_at_the_full_scale_are_saturated(tmp_path: Path, full_scale: int)
 def test_a_full_scale_that_the_frames_contradict_is_refused() -> None:
     sequence = PatternSequence((64, 48), tuple(phase_steps("x", 4, 64.0)), relative=True, full_scale=1023)
     frames = np.stack([np.uint16(16) * render(sequence, k) for k in range(4)])
-    with raises(InputError, "full scale", 1023, 4080):
+    with raises(InputError, "full_scale", 1023, 4080):
         decode(sequence, frames, "x")
-    with raises(InputError, "full scale", 1023, "uint8"):
+    with raises(InputError, "full_scale", 1023, "uint8"):
         decode(sequence, (frames // 16).astype(np.uint8), "x")
     for wrong in (0, 70000):
         with raises(InputError, wrong):

@@ -93,7 +93,7 @@ def test_advice_names_what_is_wrong():
         ("webcam-1080p", "pocket-720p", 500, {"lens": 8.0}, "lens"),
         ("webcam-1080p", "pocket-720p", 500, {"baseline": 5000.0}, "5000"),
         ("webcam-1080p", "pocket-720p", 500, {"steps": 2}, "2"),
-        ("100x100:179.99", "100x100:20", 500, {"baseline": 1490.0}, "500 mm"),
+        ("100x100:179.99", "100x100:20", 500, {"baseline": 1490.0}, "0.00436332"),
     ],
 )
 def test_impossible_plans_are_refused(camera, projector, distance, how, fact):
