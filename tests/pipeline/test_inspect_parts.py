@@ -100,6 +100,7 @@ def test_a_wrong_plan_is_refused_by_name(tmp_path: Path, old: str, new: str, nam
         read_plan(tmp_path / "plan.toml")
 
 
+@pytest.mark.computes
 def test_of_20_parts_exactly_the_4_out_of_tolerance_fail(tmp_path: Path) -> None:
     rng = np.random.default_rng(7)
     wrong = {3: 1, 8: -1, 13: 1, 17: -1}
@@ -126,6 +127,7 @@ def test_of_20_parts_exactly_the_4_out_of_tolerance_fail(tmp_path: Path) -> None
     assert [row["part"] for row in rows if row["decision"] == "fail"] == [f"part {k}" for k in wrong]
 
 
+@pytest.mark.computes
 def test_what_cannot_be_measured_is_named_and_takes_nothing_with_it(tmp_path: Path) -> None:
     plan = make_plan()
     missing = Characteristic("missing", "flatness", ("nothing",), upper=0.1)
@@ -153,6 +155,7 @@ def test_capability_of_known_spread() -> None:
     assert process_capability([1.0, 2.0], 0.0, 2.0) is None
 
 
+@pytest.mark.computes
 def test_a_plan_by_best_fit_measures_profiles_from_the_nominal_model(tmp_path: Path) -> None:
     """The nominal is a block with one sloping side; the part lies elsewhere, with a dent of 0.2 mm in its top."""
     mesh = trimesh.creation.box((80.0, 60.0, 40.0))
