@@ -97,7 +97,6 @@ def test_sound_captures_have_no_warning(sequence_of, scene):
         pytest.param({"repeated": 30}, ["frame 31", "frame 30"], marks=pytest.mark.slow),
         pytest.param({"swapped": 4}, [5, 6, "changed places"], marks=pytest.mark.slow),
         pytest.param({"dropped": 9}, ["frame 10", "missing"], marks=pytest.mark.slow),
-        ({"lag": 1, "axes": "x"}, ["one image", "behind"]),
         pytest.param({"lag": 1}, ["one image", "behind"], marks=pytest.mark.slow),
         pytest.param({"late": 21}, ["frame 22", "frame 21"], marks=pytest.mark.slow),
     ],
@@ -131,7 +130,9 @@ def test_a_saved_check_is_read_until_the_checks_change(tmp_path):
         session.save_capture("part", "scan", sequence, stack, source="a test")
         assert load_check(session, "part") is None
         saved = save_check(session, session.load_capture("part"))
-        assert saved.warnings() and load_check(session, "part").warnings() == saved.warnings()
+        assert load_check(session, "part").warnings() == saved.warnings() and len(saved.warnings()) <= 4
+        assert any(not missing_facts(message, "one image", "behind") for message in saved.warnings())
         meta, _ = session.load_result("trust/part")
-        session.save_result("trust/part", {**meta, "version": meta["version"] - 1}, {})
+        older = {**saved.to_json(), "inputs": meta["inputs"], "version": meta["version"] - 1}
+        session.save_result("trust/part", older, {})
         assert load_check(session, "part") is None

@@ -12,6 +12,8 @@ from slviewer.fringe.presets import multifrequency
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.rig import StereoRig
 from slviewer.session.exporters import write_calibration
+from slviewer.session.importers.filestorage import read_storage
+from slviewer.session.importers.opencv_calibration import read_matrices
 from slviewer.session.store import Session
 
 pytestmark = [pytest.mark.computes, pytest.mark.process]  # a process reads each storage of OpenCV
@@ -69,19 +71,27 @@ def file(folder: Path, matrices: dict, names: tuple[str, ...] = (), **more: obje
     return folder / "rig.yml"
 
 
+COMMON_NAMES = [
+    ("M1", "D1", "M2", "D2", "R", "T"),
+    ("cam_K", "cam_kc", "pro_K", "pro_kc", "R", "T"),
+    ("Kc", "kc", "Kp", "kp", "Rp", "Tp"),
+    ("cam_int", "cam_dist", "proj_int", "proj_dist", "roration", "translation"),
+    ("cameraMatrix1", "distCoeffs1", "cameraMatrix2", "distCoeffs2", "rotation", "translation"),
+]
+
+
+@pytest.mark.parametrize("names", COMMON_NAMES)
+def test_common_names_are_recognised(tmp_path: Path, names: tuple[str, ...]) -> None:
+    read = read_matrices(read_storage(file(tmp_path, entries(), names)))
+    assert set(read) == set(entries())
+    for name, matrix in entries().items():
+        np.testing.assert_allclose(read[name], matrix, atol=1e-12)
+
+
 @pytest.mark.parametrize(
-    "names",
-    [
-        ("M1", "D1", "M2", "D2", "R", "T"),
-        ("cam_K", "cam_kc", "pro_K", "pro_kc", "R", "T"),
-        ("Kc", "kc", "Kp", "kp", "Rp", "Tp"),
-        ("cam_int", "cam_dist", "proj_int", "proj_dist", "roration", "translation"),
-        ("cameraMatrix1", "distCoeffs1", "cameraMatrix2", "distCoeffs2", "rotation", "translation"),
-    ],
+    "names", [COMMON_NAMES[0], *(pytest.param(names, marks=pytest.mark.slow) for names in COMMON_NAMES[1:])]
 )
-def test_common_names_are_recognised_and_stated(
-    session: Path, run: Run, tmp_path: Path, names: tuple[str, ...]
-) -> None:
+def test_common_names_are_imported_and_stated(session: Path, run: Run, tmp_path: Path, names: tuple[str, ...]) -> None:
     path = file(tmp_path, entries(), names)
     status, out, err = run("import", "opencv-calibration", path, session)
     assert status == 0 and err == ""
