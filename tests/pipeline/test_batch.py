@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 from distributed import Client, LocalCluster
 from facts import missing_facts, raises
+from sound_checks import save_sound_checks
 
 from slviewer.cli import main
 from slviewer.errors import Cancelled, SlviewerError, UsageError
@@ -49,6 +50,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
             store.save_capture(
                 name, "scan", sequence, Renderer(rig, plan[name]).capture(sequence, i), source="simulated"
             )
+        save_sound_checks(store)
     return folder
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from facts import missing_facts
+from sound_checks import save_sound_checks
 
 from slviewer.fringe.presets import multifrequency
 from slviewer.fringe.sequence import PatternSequence
@@ -44,6 +45,7 @@ def session(tmp_path: Path, captured: tuple[PatternSequence, np.ndarray]) -> Pat
         large = replace(sequence, projector_size=tuple(2 * n for n in RIG.projector.size))
         store.save_capture("large", "scan", large, frames, source="test")
         store.save_capture("cropped", "scan", sequence, np.ascontiguousarray(frames[:, :-4]), source="test")
+        save_sound_checks(store)
     return tmp_path / "session"
 
 
@@ -63,6 +65,8 @@ def test_every_command_refuses_other_sizes_and_names_both(session: Path, run: Ru
 
 
 def test_a_sound_capture_is_measured_without_a_word(session: Path, run: Run) -> None:
+    with Session.open(session, write=True) as store:
+        store.trash_result("trust/sound")
     status, text, error = run("reconstruct", session, "sound")
     assert (status, error) == (0, "") and not missing_facts(text, "z 600-600 mm")
 

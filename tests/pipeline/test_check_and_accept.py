@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from artefact_places import bar_places
 from facts import missing_facts, raises
+from sound_checks import save_sound_checks
 
 from slviewer.errors import InputError
 from slviewer.fringe.presets import complementary, p18
@@ -53,7 +54,7 @@ spacing_mm = {limit}
 def measured(tmp_path_factory) -> Path:
     """A session whose imported calibration is the truth, with seven bars and four captures of the first one."""
     folder = tmp_path_factory.mktemp("accept") / "session"
-    rig = letter(0.15, seed=2, local_distortion_px=0)
+    rig = letter(0.25, seed=2, local_distortion_px=0)
     sequence = one_axis(p18(rig.projector.size), "x")
     with Session.create(folder) as store:
         save_true_stereo(store, rig)
@@ -64,6 +65,7 @@ def measured(tmp_path_factory) -> Path:
             for k in range(4 if i == 0 else 0):
                 frames = renderer.capture(sequence, 100 + k)
                 store.save_capture(f"still_{k}", "scan", sequence, frames, source="simulated")
+        save_sound_checks(store)
     return folder
 
 
@@ -94,6 +96,7 @@ def test_accept_finds_a_scale_and_applies_it_on_request(measured, tmp_path):
     assert json.loads(json.dumps(again.to_json()))["decision"] in ("pass", "undecided", "fail")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("spacing", "decision"), [(100.0, "pass"), (101.0, "fail")])
 def test_accept_decides(measured, tmp_path, spacing, decision):
     assert accept(measured, artefact(tmp_path, spacing, 0.2)).acceptance.decision == decision
@@ -120,7 +123,7 @@ def calibrated(recorded: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
     rig = letter(0.25)  # the recorded one
     turn = rotation(np.array([0.0, 2e-4, 0.0]))
     panned = replace(rig, R=turn @ rig.R, t=turn @ rig.t)
-    both = complementary(rig.projector.size)
+    both = complementary(rig.projector.size, steps=4)
     later = target_poses(replace(rig, seed=6), BOARD, 3)
     with Session.open(folder, write=True) as store:
         for name, moved, sequence in (

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from facts import missing_facts
+from sound_checks import save_sound_checks
 
 from slviewer.devices.capture import capture
 from slviewer.devices.simulated import simulated_rig
@@ -70,6 +71,8 @@ def read_exr(path: Path) -> np.ndarray:
 @pytest.mark.parametrize("file_format", ["npy", "exr"])
 def test_files_hold_what_was_decoded(tmp_path: Path, run: Run, part: Captured, file_format: str) -> None:
     session, out = recorded_session(tmp_path / "session", *part), tmp_path / "out"
+    with Session.open(session, write=True) as store:
+        save_sound_checks(store)
     status, text, _ = run("decode", session, "part", "--out", out, "--format", file_format)
     assert status == 0
     with Session.open(session) as store:

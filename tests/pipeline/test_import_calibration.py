@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 from facts import missing_facts
+from sound_checks import save_sound_checks
 
 from slviewer.fringe.presets import multifrequency
 from slviewer.geometry.lens import Lens
@@ -57,6 +58,7 @@ def save_wall(session: Path) -> None:
     stack = np.array(frames).reshape(-1, *u.shape) + rng.normal(0, 1, (len(frames), *u.shape))
     with Session.open_or_create(session) as store:
         store.save_capture("wall", "scan", sequence, stack.round().astype(np.uint8), source="simulated")
+        save_sound_checks(store)
 
 
 @pytest.fixture

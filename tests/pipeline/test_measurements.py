@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from facts import missing_facts, raises
+from sound_checks import save_sound_checks
 from trimesh.creation import box
 
 from slviewer.errors import InputError, SessionError
@@ -52,6 +53,7 @@ def made(tmp_path_factory) -> Path:
         for i, (name, scene) in enumerate(scenes.items()):
             frames = Renderer(rig, scene).capture(sequence, i)
             store.save_capture(name, "scan", sequence, frames, source="simulated")
+        save_sound_checks(store)
     return folder
 
 

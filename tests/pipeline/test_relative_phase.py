@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from facts import missing_facts
+from sound_checks import save_sound_checks
 
 from slviewer.fringe.presets import multifrequency
 from slviewer.fringe.sequence import PatternSequence
@@ -43,6 +44,7 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
         unknown = replace(relative, projector_size=None, relative=False)
         store.save_capture("unknown", "scan", unknown, frames[finer], source="test")
         store.save_capture("pose", "calibration", relative, frames[finer], source="test")
+        save_sound_checks(store)
     return folder
 
 
