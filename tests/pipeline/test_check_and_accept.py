@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from artefact_places import bar_places
+from artefact_places import Place, bar_places
 from facts import missing_facts, raises
 from sound_checks import save_sound_checks
 
@@ -50,21 +50,45 @@ spacing_mm = {limit}
 """
 
 
+def bar(place: Place) -> Spheres:
+    T = place.T_camera_artefact
+    return Spheres(T[:3, 3] + np.array([[-50.0], [50.0]]) * T[:3, 0], 19.05)
+
+
 @pytest.fixture(scope="module")
 def measured(tmp_path_factory) -> Path:
-    """A session whose imported calibration is the truth, with seven bars and four captures of the first one."""
+    """A session whose imported calibration is the truth, with seven bars."""
     folder = tmp_path_factory.mktemp("accept") / "session"
     rig = letter(0.25, seed=2, local_distortion_px=0)
     sequence = one_axis(p18(rig.projector.size), "x")
     with Session.create(folder) as store:
         save_true_stereo(store, rig)
         for i, place in enumerate(bar_places(load_stereo(store).rig, (500.0, 700.0), 100.0, 38.1)):
-            T = place.T_camera_artefact
-            renderer = Renderer(rig, Spheres(T[:3, 3] + np.array([[-50.0], [50.0]]) * T[:3, 0], 19.05))
+            renderer = Renderer(rig, bar(place))
             store.save_capture(f"bar_{i}", "scan", sequence, renderer.capture(sequence, i), source="simulated")
-            for k in range(4 if i == 0 else 0):
-                frames = renderer.capture(sequence, 100 + k)
-                store.save_capture(f"still_{k}", "scan", sequence, frames, source="simulated")
+        save_sound_checks(store)
+    return folder
+
+
+@pytest.fixture
+def bare(tmp_path: Path) -> Path:
+    """A session with an imported calibration alone."""
+    with Session.create(tmp_path / "session") as store:
+        save_true_stereo(store, letter(0.25))
+    return tmp_path / "session"
+
+
+@pytest.fixture
+def still(measured: Path, tmp_path: Path) -> Path:
+    """A copy of the seven bars, with four more captures of the first one."""
+    folder, rig = Path(shutil.copytree(measured, tmp_path / "session")), letter(0.25, seed=2, local_distortion_px=0)
+    sequence = one_axis(p18(rig.projector.size), "x")
+    with Session.open(folder, write=True) as store:
+        place = bar_places(load_stereo(store).rig, (500.0, 700.0), 100.0, 38.1)[0]
+        renderer = Renderer(rig, bar(place))
+        for k in range(4):
+            frames = renderer.capture(sequence, 100 + k)
+            store.save_capture(f"still_{k}", "scan", sequence, frames, source="simulated")
         save_sound_checks(store)
     return folder
 
@@ -75,7 +99,9 @@ def artefact(folder: Path, spacing: float = 100.0, limit: float = 0.1) -> Path:
     return path
 
 
-def test_accept_finds_a_scale_and_applies_it_on_request(measured, tmp_path):
+@pytest.mark.slow
+def test_accept_finds_a_scale_and_applies_it_on_request(still, tmp_path):
+    measured = still
     short = artefact(tmp_path, 100.0 / (1 + 500e-6))  # against a certificate that says 500 ppm less
     first = accept(measured, short, still=[f"still_{k}" for k in range(4)])
     scale = first.acceptance.scale
@@ -96,47 +122,52 @@ def test_accept_finds_a_scale_and_applies_it_on_request(measured, tmp_path):
     assert json.loads(json.dumps(again.to_json()))["decision"] in ("pass", "undecided", "fail")
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("spacing", "decision"), [(100.0, "pass"), (101.0, "fail")])
 def test_accept_decides(measured, tmp_path, spacing, decision):
     assert accept(measured, artefact(tmp_path, spacing, 0.2)).acceptance.decision == decision
 
 
-def test_accept_names_what_is_missing(measured, tmp_path):
+def test_accept_names_what_is_missing(bare, tmp_path):
     path = artefact(tmp_path)
     path.write_text(path.read_text().replace("bar_*", "beam_*"))
     with raises(InputError, "'beam_*'"):
-        accept(measured, path)
+        accept(bare, path)
     path.write_text("kind = ")
     with raises(InputError, path.name, "TOML"):
-        accept(measured, path)
+        accept(bare, path)
 
 
-@pytest.fixture(scope="module")
-def calibrated(recorded: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The recorded session; later the board with the rig as it was, turned by 0.2 mrad, and along one axis alone."""
-    folder, others = (
-        tmp_path_factory.mktemp("drift") / "session",
-        shutil.ignore_patterns("object_*", "plane_*", "sphere_*"),
-    )
-    shutil.copytree(recorded / "session", folder, ignore=others)
+@pytest.fixture
+def calibrated(recorded: Path, tmp_path: Path) -> Path:
+    """A copy of the recorded session: its target poses, and their calibration."""
+    folder, others = tmp_path / "session", shutil.ignore_patterns("object_*", "plane_*", "sphere_*")
+    return Path(shutil.copytree(recorded / "session", folder, ignore=others))
+
+
+def capture_board(folder: Path, name: str) -> None:
+    """Capture the board later: with the rig as it was (same), turned by 0.2 mrad (panned), or along one_axis alone."""
     rig = letter(0.25)  # the recorded one
-    turn = rotation(np.array([0.0, 2e-4, 0.0]))
-    panned = replace(rig, R=turn @ rig.R, t=turn @ rig.t)
-    both = complementary(rig.projector.size, steps=4)
-    later = target_poses(replace(rig, seed=6), BOARD, 3)
+    both, turn = complementary(rig.projector.size, steps=4), rotation(np.array([0.0, 2e-4, 0.0]))
+    pose = target_poses(replace(rig, seed=6), BOARD, 3)[0]
+    moved = replace(rig, R=turn @ rig.R, t=turn @ rig.t) if name == "panned" else rig
+    sequence = one_axis(both, "x") if name == "one_axis" else both
+    frames = Renderer(moved, printed_board(BOARD, pose)).capture(sequence, 50)
     with Session.open(folder, write=True) as store:
-        for name, moved, sequence in (
-            ("same", rig, both),
-            ("panned", panned, both),
-            ("one_axis", rig, one_axis(both, "x")),
-        ):
-            frames = Renderer(moved, printed_board(BOARD, later[0])).capture(sequence, 50)
-            store.save_capture(name, "scan", sequence, frames, source="simulated")
-    return folder
+        store.save_capture(name, "scan", sequence, frames, source="simulated")
 
 
-def test_check_answers_and_remembers(calibrated):
+def test_check_finds_a_projector_that_was_turned(calibrated: Path) -> None:
+    capture_board(calibrated, "panned")
+    panned = check(calibrated, "panned")
+    assert panned.drift.verdict == "recalibrate" and not missing_facts(panned.drift.reasons[0], "pan")
+    with Session.open(calibrated) as store:
+        assert load_drift_history(store) == (panned.latest,) and store.state_of(REFERENCE) == "fresh"
+
+
+@pytest.mark.slow
+def test_check_answers_and_remembers(calibrated: Path) -> None:
+    for name in ("same", "panned", "one_axis"):
+        capture_board(calibrated, name)
     same = check(calibrated, "same")
     assert same.drift.verdict == "still good" and same.before == ()
     panned = check(calibrated, "panned")
@@ -152,6 +183,6 @@ def test_check_answers_and_remembers(calibrated):
     assert json.loads(json.dumps(single.to_json()))["before"][1]["verdict"] == "recalibrate"
 
 
-def test_a_calibration_from_elsewhere_has_no_floor(measured):
-    with raises(InputError):
-        check(measured, "bar_0")
+def test_a_calibration_from_elsewhere_has_no_floor(bare):
+    with raises(InputError, "elsewhere"):
+        check(bare, "bar_0")

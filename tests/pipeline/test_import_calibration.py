@@ -122,8 +122,14 @@ INVERSE = {"R": RIG.R.T, "T": -RIG.R.T @ RIG.t}
     [
         (INVERSE, ["wall", "R", "T", "inverted"]),
         ({"K_projector": scaled(RIG.projector.K, 2)}, ["wall", "projector", "halve", "fx"]),
-        ({"K_projector": scaled(RIG.projector.K, 0.5)}, ["wall", "projector", "double", "fx"]),
-        ({"K_camera": scaled(RIG.camera.K, 2)}, ["wall", "camera's matrix", "halve", "fx"]),
+        pytest.param(
+            {"K_projector": scaled(RIG.projector.K, 0.5)},
+            ["wall", "projector", "double", "fx"],
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            {"K_camera": scaled(RIG.camera.K, 2)}, ["wall", "camera's matrix", "halve", "fx"], marks=pytest.mark.slow
+        ),
     ],
 )
 def test_a_capture_contradicts_a_calibration(
