@@ -31,7 +31,7 @@ Captured = tuple[PatternSequence, np.ndarray]
 
 def captured(sequence_of: Callable) -> Captured:
     world = SimulatedWorld(letter(0.15, 0))
-    world.place("object")
+    world.place("sphere")
     rig = simulated_rig(world)
     sequence = sequence_of(rig.projector.size)
     with rig.opened():
@@ -40,7 +40,7 @@ def captured(sequence_of: Callable) -> Captured:
 
 @pytest.fixture(scope="module")
 def part() -> Captured:
-    """An object in patterns of both axes: the sequence, and its frames (n, h, w), only to be read."""
+    """A sphere in patterns of both axes: the sequence, and its frames (n, h, w), only to be read."""
     return captured(complementary)
 
 

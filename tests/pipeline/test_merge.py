@@ -40,6 +40,7 @@ def test_starts_that_do_not_fit_together_are_refused_at_once(tmp_path) -> None:
         merge(tmp_path / "nowhere", ["a"], "b", out.with_suffix(".stl"))
 
 
+@pytest.mark.slow
 @pytest.mark.computes
 def test_a_plate_is_merged_by_its_markers(tmp_path: Path) -> None:
     """Two scans of the simulated rig's marked plate, which slides on itself without them."""
@@ -78,7 +79,7 @@ def test_scans_without_markers_are_refused_with_what_to_do(tmp_path: Path) -> No
     true_calibration(session, letter(0.25))
     world = SimulatedWorld(letter(0.25))
     for name, depth in (("one", 600.0), ("two", 640.0)):
-        world.place("object")
+        world.place("plane")
         world.move(distance_mm=depth)
         bench = RigSetup(simulated_rig(world))
         capture(session, name, {}, role="scan", patterns="gray", set_up=lambda *_, bench=bench: bench)

@@ -20,7 +20,10 @@ BUDGETS = (
 
 
 @pytest.mark.computes
-@pytest.mark.parametrize(("camera", "projector", "distance"), BUDGETS)
+@pytest.mark.parametrize(
+    ("camera", "projector", "distance"),
+    [BUDGETS[0], *(pytest.param(*budget, marks=pytest.mark.slow) for budget in BUDGETS[1:])],
+)
 @pytest.mark.parametrize(
     "how",
     [
