@@ -4,6 +4,7 @@ Noise is propagated as decoding and the stereo model do it (`PhaseMap.sigma_phas
 devices is blur, noise and light. Errors of a calibration are not part of the prediction.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -130,8 +131,12 @@ def plan_rig(
     baseline: float,
     light: PlannedLight | None = None,
     period_px: float | None = None,
+    depth_factors: Sequence[float] | np.ndarray = _DEPTHS,
 ) -> RigPlan:
-    """Predict what a rig measures at a distance, mm. ``period_px``: of the fringes, by default the best.
+    """Predict what a rig measures at a distance, mm.
+
+    ``period_px``: of the fringes, by default the best. ``depth_factors``, ascending: the depths, as multiples of the
+    distance, among which the usable range is found.
 
     Raises InputError where the projector does not illuminate what the camera sees there.
     """
@@ -151,7 +156,7 @@ def plan_rig(
     period = period_px or _best_period(float(np.median(optics.blur_px(distance)[is_lit])), camera_px / projector_px)
     sigmas, modulation = optics.predict_sigma(distance, period, is_lit)
     middle, corner = _middle_and_corner(sigmas)
-    depths = distance * _DEPTHS
+    depths = distance * np.asarray(depth_factors, float)
     is_usable = np.array([_is_usable(optics, z, period, coverage, middle) for z in depths])
     columns, rows = projector.size
     return RigPlan(

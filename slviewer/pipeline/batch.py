@@ -128,7 +128,7 @@ def batch(
     task = Task(do, secrets.token_hex(4), model, shape, radius, accept_rejected)
     progress(0.0, f"looking into {len(addresses)} sessions")
     try:
-        with _start_cluster() if scheduler is None else _connect(scheduler) as client:
+        with _start_cluster() if scheduler is None else connect(scheduler) as client:
             listing = {address: (list_captures, address, tuple(captures), task.version) for address in addresses}
             plans = _gather_results(client, listing, ignore_progress, warn)
             broken = {address: plan for address, plan in plans.items() if isinstance(plan, str)}
@@ -167,13 +167,16 @@ def _write_verifications(client: Any, done: Sequence[TaskResult], task: Task, wa
 
 
 @contextmanager
-def _connect(scheduler: str) -> Iterator[Any]:
-    """Yield a client of a running scheduler that has a worker. Raises SlviewerError otherwise."""
+def connect(scheduler: str, timeout_s: float = CONNECT_TIMEOUT_S) -> Iterator[Any]:
+    """Yield a client of a running scheduler that has a worker.
+
+    Raises SlviewerError where the scheduler does not answer in ``timeout_s``, or then has no worker for as long.
+    """
     _check_installed()
     from distributed import Client
 
     try:
-        client = Client(scheduler, timeout=CONNECT_TIMEOUT_S, set_as_default=False)
+        client = Client(scheduler, timeout=timeout_s, set_as_default=False)
     except (OSError, ValueError, TimeoutError) as error:
         raise SlviewerError(
             f"no Dask scheduler answers at {scheduler} ({error}): start one with `dask scheduler`, or leave "
@@ -181,7 +184,7 @@ def _connect(scheduler: str) -> Iterator[Any]:
         ) from error
     with client:
         try:
-            client.wait_for_workers(1, timeout=CONNECT_TIMEOUT_S)
+            client.wait_for_workers(1, timeout=timeout_s)
         except TimeoutError as error:
             raise SlviewerError(
                 f"the scheduler at {scheduler} has no workers: start some with `dask worker {scheduler}`"

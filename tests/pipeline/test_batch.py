@@ -1,4 +1,7 @@
-"""`slviewer batch` with a real Dask scheduler and real worker processes: as alone, also when one of them is killed."""
+"""`slviewer batch` with a real Dask scheduler and real worker processes: as alone, also when one of them is killed.
+
+By default one test has its workers in this process, and one starts its own; the others are slow.
+"""
 
 import json
 import shutil
@@ -6,17 +9,19 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from distributed import Client
+from distributed import Client, LocalCluster
+from facts import missing_facts, raises
+from sound_checks import save_sound_checks
 
 from slviewer.cli import main
 from slviewer.errors import Cancelled, SlviewerError, UsageError
 from slviewer.fringe.presets import p18
 from slviewer.fringe.sequence import one_axis
-from slviewer.pipeline.batch import batch
+from slviewer.pipeline.batch import batch, connect
 from slviewer.pipeline.reconstruct import reconstruct
 from slviewer.pipeline.simulate import save_true_stereo
 from slviewer.pipeline.verify import verify
@@ -27,8 +32,8 @@ from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import letter
 from slviewer.target.board import Board
 
-pytestmark = pytest.mark.computes
-
+HANG_S = 300.0
+"""Only what hangs takes as long."""
 SPHERES, PLANES = ("sphere_1", "sphere_3"), ("plane_03", "plane_04", "plane_05")
 
 
@@ -45,18 +50,25 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
             store.save_capture(
                 name, "scan", sequence, Renderer(rig, plan[name]).capture(sequence, i), source="simulated"
             )
+        save_sound_checks(store)
     return folder
 
 
 @pytest.fixture(scope="module")
-def alone(made: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
-    """What each command makes of the session alone; the machine code of all workers is compiled then too."""
-    out = tmp_path_factory.mktemp("alone")
+def clouds(made: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    """The clouds that `reconstruct` alone makes; the machine code of all workers is compiled then too."""
+    out = tmp_path_factory.mktemp("clouds")
     for name in (*SPHERES, *PLANES):
         reconstruct(made, name, out=out / f"{name}_stereo.ply")
+    return {path.name: path.read_bytes() for path in out.iterdir()}
+
+
+@pytest.fixture(scope="module")
+def meshes(made: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    """The meshes that `reconstruct` alone makes."""
+    out = tmp_path_factory.mktemp("meshes")
+    for name in (*SPHERES, *PLANES):
         reconstruct(made, name, mesh=True, out=out / f"{name}_stereo_mesh.ply")
-    verified = verify(made, SPHERES, "sphere").to_json()
-    (out / "verification_sphere.json").write_text(json.dumps(verified, indent=2) + "\n")
     return {path.name: path.read_bytes() for path in out.iterdir()}
 
 
@@ -64,6 +76,14 @@ def alone(made: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, byt
 def session(made: Path, tmp_path: Path) -> Path:
     """A copy to work in."""
     return Path(shutil.copytree(made, tmp_path / "session", ignore=shutil.ignore_patterns("exports")))
+
+
+def until(condition: Callable[[], bool]) -> None:
+    """Wait until a condition holds."""
+    end = time.monotonic() + HANG_S
+    while not condition():
+        assert time.monotonic() < end, "it hangs"
+        time.sleep(0.05)
 
 
 class Cluster:
@@ -77,11 +97,10 @@ class Cluster:
 
     def ready(self) -> None:
         """Wait until both workers can be given work."""
-        while not self.file.exists():
-            time.sleep(0.05)
+        until(self.file.exists)
         self.address: str = json.loads(self.file.read_text())["address"]
         with Client(self.address, set_as_default=False) as client:
-            client.wait_for_workers(2, timeout=60)
+            client.wait_for_workers(2, timeout=HANG_S)
 
     def given(self, name: str) -> int:
         """How many tasks a worker was given and has not answered."""
@@ -102,7 +121,7 @@ class Cluster:
 
 
 @pytest.fixture(scope="module")
-def cluster(tmp_path_factory: pytest.TempPathFactory, alone: dict[str, bytes]) -> Iterator[Cluster]:
+def cluster(tmp_path_factory: pytest.TempPathFactory, clouds: dict[str, bytes]) -> Iterator[Cluster]:
     found = Cluster(tmp_path_factory.mktemp("dask"))
     try:
         found.ready()
@@ -111,55 +130,74 @@ def cluster(tmp_path_factory: pytest.TempPathFactory, alone: dict[str, bytes]) -
         found.end()
 
 
+@pytest.fixture
+def scheduler(request: pytest.FixtureRequest) -> Iterator[str]:
+    """The address of a scheduler with a worker in this process, or with two of their own."""
+    if request.param == "processes":
+        yield request.getfixturevalue("cluster").address
+        return
+    with LocalCluster(1, threads_per_worker=1, processes=False, dashboard_address=None) as local:
+        yield local.scheduler_address
+
+
 def made_in(session: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in (session / "exports").iterdir()}
 
 
+@pytest.mark.computes
+@pytest.mark.parametrize(
+    "scheduler", ["threads", pytest.param("processes", marks=[pytest.mark.process, pytest.mark.slow])], indirect=True
+)
 def test_a_batch_makes_what_the_commands_make_and_names_what_failed(
-    session: Path, tmp_path: Path, alone: dict[str, bytes], cluster: Cluster, capsys: pytest.CaptureFixture[str]
+    session: Path, tmp_path: Path, clouds: dict[str, bytes], scheduler: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     remote = Path(shutil.copytree(session, tmp_path / "remote"))
     (session / "captures" / "plane_04" / "frames.zarr" / "c.3.0.0").unlink()
     where = [str(session), f"file://{remote}", str(tmp_path / "nowhere")]
     out = tmp_path / "summary.json"
-    arguments = ["--scheduler", cluster.address, "--json", str(out)]
+    arguments = ["--scheduler", scheduler, "--json", str(out)]
     assert main(["batch", *where, "--do", "reconstruct", *arguments]) == 1
     said = capsys.readouterr()
-    clouds = {name: data for name, data in alone.items() if name.endswith("_stereo.ply")}
     assert made_in(remote) == clouds
     assert made_in(session) == {name: data for name, data in clouds.items() if not name.startswith("plane_04")}
-    assert f"failed: {session} plane_04: " in said.out
-    assert f"failed: {tmp_path / 'nowhere'}: " in said.out and "9 captures done, 2 failed" in said.out
-    assert " 2 " in said.err.splitlines()[-1]
+    failed = [line for line in said.out.splitlines() if line.startswith("failed: ")]
+    assert len(failed) == 2 and not missing_facts(said.out, "9 captures", "2 failed")
+    for facts in ((session, "plane_04"), (tmp_path / "nowhere",)):
+        assert any(not missing_facts(line, *facts) for line in failed)
+    assert not missing_facts(said.err.splitlines()[-1], 2)
     summary = json.loads(out.read_text())
     assert "damaged" in summary["sessions"][str(session)]["captures"]["plane_04"]["failed"]
     assert summary["sessions"][f"file://{remote}"]["captures"]["plane_04"]["failed"] is None
 
 
-def test_verifications_of_a_session_become_one(session: Path, alone: dict[str, bytes], cluster: Cluster) -> None:
+@pytest.mark.process
+@pytest.mark.slow
+def test_verifications_of_a_session_become_one(session: Path, made: Path, cluster: Cluster) -> None:
     found = batch([session], "verify", captures=["sphere_*"], shape="sphere", scheduler=cluster.address)
     assert not found.failed and [done.capture for done in found.done] == list(SPHERES)
-    assert made_in(session) == {"verification_sphere.json": alone["verification_sphere.json"]}
+    alone = json.dumps(verify(made, SPHERES, "sphere").to_json(), indent=2) + "\n"
+    assert made_in(session) == {"verification_sphere.json": alone.encode()}
 
 
-def test_a_cancelled_batch_leaves_whole_files(session: Path, alone: dict[str, bytes], cluster: Cluster) -> None:
+@pytest.mark.process
+@pytest.mark.slow
+def test_a_cancelled_batch_leaves_whole_files(session: Path, clouds: dict[str, bytes], cluster: Cluster) -> None:
     def stop(done: float, doing: str) -> None:
         if done > 0:
             raise Cancelled("stopped")
 
-    with pytest.raises(Cancelled):
+    with raises(Cancelled):
         batch([session], "reconstruct", scheduler=cluster.address, progress=stop)
     # the scheduler forgets a cancelled piece at once; a worker in the middle of one ends it, and clears up
-    deadline = time.monotonic() + 60
     with Client(cluster.address, set_as_default=False) as client:
-        while any(client.run(lambda dask_worker: len(dask_worker.state.tasks)).values()):
-            assert time.monotonic() < deadline, "a worker does not end"
-            time.sleep(0.05)
+        until(lambda: not any(client.run(lambda dask_worker: len(dask_worker.state.tasks)).values()))
     found = made_in(session)
-    assert found and found.items() < alone.items()
+    assert found and found.items() < clouds.items()
 
 
-def test_a_killed_worker_costs_a_retry(session: Path, alone: dict[str, bytes], cluster: Cluster) -> None:
+@pytest.mark.process
+@pytest.mark.slow
+def test_a_killed_worker_costs_a_retry(session: Path, meshes: dict[str, bytes], cluster: Cluster) -> None:
     victim, lost = cluster.workers["victim"], []
 
     def kill(done: float, doing: str) -> None:
@@ -171,24 +209,27 @@ def test_a_killed_worker_costs_a_retry(session: Path, alone: dict[str, bytes], c
     found = batch([session], "mesh", scheduler=cluster.address, progress=kill)
     assert lost[0] >= 1 and victim.wait() == -signal.SIGKILL
     assert not found.failed
-    assert made_in(session) == {name: data for name, data in alone.items() if name.endswith("_mesh.ply")}
+    assert made_in(session) == meshes
     assert len(read_ply(session / "exports" / "plane_03_stereo_mesh.ply").faces) > 10_000
 
 
-def test_workers_of_its_own(session: Path, alone: dict[str, bytes], capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.process
+@pytest.mark.computes
+def test_workers_of_its_own(session: Path, clouds: dict[str, bytes], capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["batch", str(session), "--do", "reconstruct", "--captures", "plane_03"]) == 0
-    assert "1 captures done, 0 failed" in capsys.readouterr().out
-    assert made_in(session) == {"plane_03_stereo.ply": alone["plane_03_stereo.ply"]}
+    assert not missing_facts(capsys.readouterr().out, "1 captures", "0 failed")
+    assert made_in(session) == {"plane_03_stereo.ply": clouds["plane_03_stereo.ply"]}
 
 
-def test_what_cannot_be_begun_is_said(session: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(UsageError, match="--shape"):
-        batch([session], "verify")
-    with pytest.raises(UsageError, match="--do verify"):
-        batch([session], "mesh", shape="plane")
-    monkeypatch.setattr("slviewer.pipeline.batch.CONNECT_TIMEOUT_S", 0.2)
-    with pytest.raises(SlviewerError, match="tcp://127"):
-        batch([session], "reconstruct", scheduler="tcp://127.0.0.1:9")
-    monkeypatch.setattr("slviewer.pipeline.batch.find_spec", lambda package: None)
-    with pytest.raises(SlviewerError, match=r"pip install 'slviewer\[batch\]'"):
-        batch([session], "reconstruct")
+def test_a_batch_that_cannot_begin_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with raises(UsageError, "--shape"):
+        batch([tmp_path], "verify")
+    with raises(UsageError, "--do verify"):
+        batch([tmp_path], "mesh", shape="plane")
+    with raises(SlviewerError, "nowhere://x"):
+        batch([tmp_path], "reconstruct", scheduler="nowhere://x")
+    with raises(SlviewerError, "tcp://127.0.0.1:9"), connect("tcp://127.0.0.1:9", timeout_s=0.2):
+        pass
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with raises(SlviewerError, "distributed", "pip install 'slviewer[batch]'"):
+        batch([tmp_path], "reconstruct")

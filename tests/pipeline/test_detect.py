@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from facts import missing_facts, raises
 
 from slviewer.cli import main
 from slviewer.errors import InputError
@@ -31,12 +32,13 @@ def photographs(tmp_path: Path) -> Path:
     return folder
 
 
+@pytest.mark.computes
 def test_one_photograph_gives_a_table_and_an_overlay(photographs: Path, tmp_path: Path, capsys) -> None:
     overlay, table = tmp_path / "out" / "overlay.png", tmp_path / "out" / "corners.csv"
     image = str(photographs / "board.png")
     assert main(["detect", image, "--target", str(BOARD), "--out", str(overlay), "--csv", str(table)]) == 0
     printed = capsys.readouterr().out
-    assert "35 of 35 circles detected" in printed and len(printed.splitlines()) == 37
+    assert not missing_facts(printed, "35 of 35 circles") and len(printed.splitlines()) == 37
     rows = list(csv.DictReader(table.open()))
     places = np.array([[float(row[name]) for name in ("index", "x_mm", "y_mm", "u_px", "v_px")] for row in rows])
     np.testing.assert_array_equal(places[:, 0], np.arange(35))
@@ -51,20 +53,21 @@ def test_one_photograph_gives_a_table_and_an_overlay(photographs: Path, tmp_path
     assert np.ptp(picture.astype(int), axis=2).max() > 100 and plain.ndim == 2
 
 
+@pytest.mark.computes
 def test_several_photographs_give_a_line_each_and_status_1(photographs: Path, tmp_path: Path, capsys) -> None:
     overlays = tmp_path / "overlays"
     assert main(["detect", str(photographs), "--target", str(BOARD), "--out", str(overlays)]) == 1
     printed = capsys.readouterr()
-    assert printed.out.splitlines()[0].startswith("board.png: 35 of 35")
-    assert "wall.png: " in printed.out and "1 of 2" in printed.out
-    assert "1 of 2 images" in printed.err
+    assert not missing_facts(printed.out.splitlines()[0], "board.png", "35 of 35")
+    assert not missing_facts(printed.out, "wall.png", "1 of 2")
+    assert not missing_facts(printed.err, "1 of 2 images")
     assert sorted(path.name for path in overlays.iterdir()) == ["board_board.png", "wall_board.png"]
 
 
 def test_what_is_no_photograph_is_named(tmp_path: Path) -> None:
-    with pytest.raises(InputError):
+    with raises(InputError, "nowhere.png"):
         detect_board([tmp_path / "nowhere.png"], str(BOARD))
-    with pytest.raises(InputError):
+    with raises(InputError, tmp_path):
         detect_board([tmp_path], str(BOARD))
     (tmp_path / "broken.png").write_bytes(b"no image")
     result = detect_board([tmp_path], "circles:7x5:20")
@@ -72,6 +75,7 @@ def test_what_is_no_photograph_is_named(tmp_path: Path) -> None:
     assert result.to_json()["images"][0]["detected"] is False
 
 
+@pytest.mark.computes
 def test_corners_that_are_seen_of_a_charuco_board_keep_their_numbers(tmp_path: Path) -> None:
     board = Board.parse("charuco:7x5:20")
     view = View(size=(400, 300), supersample=4, fill=0.6, hide=(-30, -30, 30, 90))
@@ -79,5 +83,5 @@ def test_corners_that_are_seen_of_a_charuco_board_keep_their_numbers(tmp_path: P
     result = detect_board([tmp_path / "part.png"], str(board), out=tmp_path / "part_overlay.png")
     detection = result.images[0].detection
     assert detection is not None and 8 <= len(detection.ids) < len(board.points)
-    assert f"{len(detection.ids)} of 24 corners detected" in result.text()
+    assert not missing_facts(result.text(), f"{len(detection.ids)} of 24 corners")
     assert [row[1] for row in result.rows()] == detection.ids.tolist()

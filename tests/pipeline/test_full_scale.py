@@ -8,6 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from facts import missing_facts, raises
 
 from slviewer.devices.protocols import Rig, stated_full_scale
 from slviewer.devices.replay import replay
@@ -121,7 +122,7 @@ def test_pixels_at_the_full_scale_are_saturated(tmp_path: Path, full_scale: int)
     clipped = (phase.reason == Reason.SATURATED).mean()
     assert 0.05 < clipped < 0.9
     np.testing.assert_array_equal(decode_reference(sequence, frames, "x").reason == Reason.SATURATED, phase.reason == 2)
-    assert any("saturated and masked" in message for message in loss_warnings(sequence, frames, {"x": phase}))
+    assert any("saturated" in message for message in loss_warnings(sequence, frames, {"x": phase}))
     assert check_capture(folder, "a").check("exposure").figures["saturated_share"] > 0.05
     unstated = (decode(replace(sequence, full_scale=None), frames, "x").reason == Reason.SATURATED).mean()
     assert unstated == (clipped if full_scale == 4095 else 0)
@@ -130,14 +131,14 @@ def test_pixels_at_the_full_scale_are_saturated(tmp_path: Path, full_scale: int)
 def test_a_full_scale_that_the_frames_contradict_is_refused() -> None:
     sequence = PatternSequence((64, 48), tuple(phase_steps("x", 4, 64.0)), relative=True, full_scale=1023)
     frames = np.stack([np.uint16(16) * render(sequence, k) for k in range(4)])
-    with pytest.raises(InputError, match=r"1023, .*4080"):
+    with raises(InputError, "full_scale", 1023, 4080):
         decode(sequence, frames, "x")
-    with pytest.raises(InputError, match=r"1023, .*uint8"):
+    with raises(InputError, "full_scale", 1023, "uint8"):
         decode(sequence, (frames // 16).astype(np.uint8), "x")
     for wrong in (0, 70000):
-        with pytest.raises(InputError, match=str(wrong)):
+        with raises(InputError, wrong):
             replace(sequence, full_scale=wrong)
-    with pytest.raises(InputError, match="full_scale"):
+    with raises(InputError, "full_scale"):
         PatternSequence.from_dict({**sequence.to_dict(), "full_scale": "twelve bits"})
     assert PatternSequence.from_dict(sequence.to_dict()) == sequence
 
@@ -196,21 +197,23 @@ def _toml(frame: Frame) -> str:
     return "".join(f"{key} = {value!r}\n" for key, value in frame.to_dict().items())
 
 
+@pytest.mark.computes
 def test_a_description_states_the_full_scale(tmp_path: Path) -> None:
     warnings: list[str] = []
     source = write_frames(tmp_path / "a", head="full_scale = 4095\n")
     import_captures(source, tmp_path / "s", warn=warnings.append)
-    assert any("of the camera's range" in message for message in warnings), warnings
+    assert any(not missing_facts(message, "camera's range") for message in warnings), warnings
     with Session.open(tmp_path / "s") as store:
         shot = store.load_capture("a")
     assert shot.sequence.full_scale == 4095 and shot.files[:2] == ("00.png", "01.png")
     source = write_frames(tmp_path / "b", head="full_scale = 100\n")
-    with pytest.raises(InputError, match=r"full_scale .*100"):
+    with raises(InputError, "full_scale", 100):
         import_captures(source, tmp_path / "s")
 
 
+@pytest.mark.computes
 def test_messages_name_the_files_of_frames(tmp_path: Path) -> None:
     count = len(gray((120, 90)).frames)
     order = [*range(3), 4, 3, *range(5, count)]
-    with pytest.raises(InputError, match=r"frames 4 \(03\.png\) and 5 \(04\.png\)"):
+    with raises(InputError, "4 (03.png)", "5 (04.png)"):
         import_captures(write_frames(tmp_path / "a", order), tmp_path / "s")

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from facts import missing_facts, raises
 
 from slviewer.calibration.splined import model as splined
 from slviewer.errors import InputError, SessionError
@@ -13,12 +14,14 @@ from slviewer.pipeline.models import available_models, load_model, preferred_mod
 from slviewer.session.store import Session
 from slviewer.wizard.operator import Operator
 
+HANG_S = 120.0
+
 
 @pytest.mark.parametrize("name", ["pixelwise", "splined"])
 def test_a_calibration_of_another_layout_is_refused_with_what_to_do(tmp_path: Path, name: str) -> None:
     with Session.create(tmp_path / "session") as store:
         store.save_result(f"calibration/{name}", {"model": {"axes": ["x"], "periods_px": {"x": 18}}}, {"z": np.eye(2)})
-        with pytest.raises(SessionError, match=f"{name}.*`slviewer calibrate`"):
+        with raises(SessionError, name, "slviewer calibrate"):
             load_model(store, name)
 
 
@@ -28,10 +31,10 @@ def test_a_calibration_of_a_model_that_is_no_more_is_ignored(recorded: Path, tmp
         store.save_result("calibration/anchored", {"model": {"axes": ["x"]}, "inputs": {}}, {"z": np.eye(2)})
         store.decide("model", "anchored")
         assert available_models(store) == ("stereo", "pixelwise", "splined") and preferred_model(store) == "splined"
-        with pytest.raises(InputError, match=r"anchored .*stereo, pixelwise, splined"):
+        with raises(InputError, "anchored", "stereo", "pixelwise", "splined"):
             load_model(store, "anchored")
     with Operator(folder) as operator:
-        shown = operator.wait_for(lambda s: s.session is not None and s.session.calibration is not None, 20.0)
+        shown = operator.wait_for(lambda s: s.session is not None and s.session.calibration is not None, HANG_S)
         assert shown is not None and shown.session is not None and shown.session.calibration is not None
         assert shown.session.calibration.models == ("stereo", "pixelwise", "splined")
 
@@ -47,7 +50,7 @@ def test_what_is_stale_is_told_in_one_sentence(tmp_path: Path) -> None:
             store.save_result(f"calibration/{name}", {"inputs": {"pose_01": "gone"}}, {"z": np.eye(2)})
         warn_if_stale(store, said.append)
     (sentence,) = said
-    assert "stereo" in sentence and "splined" in sentence
+    assert not missing_facts(sentence, "stereo", "splined")
 
 
 def test_the_wizard_opens_a_session_of_another_version_and_says_what_to_do(recorded: Path, tmp_path: Path) -> None:
@@ -58,7 +61,7 @@ def test_the_wizard_opens_a_session_of_another_version_and_says_what_to_do(recor
         kept = {key: meta[key] for key in ("model", "inputs", "settings")}
         store.save_result("calibration/pixelwise", kept, {"coefficients": np.zeros((2, 2))})
     with Operator(folder) as operator:
-        shown = operator.wait_for(lambda s: s.session is not None and s.session.calibration is not None, 20.0)
+        shown = operator.wait_for(lambda s: s.session is not None and s.session.calibration is not None, HANG_S)
         assert shown is not None and shown.session is not None and shown.session.calibration is not None
         assert "version" in shown.session.calibration.stale
         assert shown.session.calibration.stereo.reprojection_rms_px

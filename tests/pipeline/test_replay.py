@@ -5,6 +5,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from facts import raises
 
 from slviewer.errors import InputError, SessionError
 from slviewer.fringe.presets import complementary
@@ -55,10 +56,11 @@ def test_one_capture_is_played_again_and_again(recorded: Path):
     with played.rig.opened() as rig:
         rig.projector.load(played.sequence)
         np.testing.assert_array_equal(seen(rig, 0), frames_of(recorded, "scan_2")[0])
-    with pytest.raises(InputError, match="scan_1, scan_2"):
+    with raises(InputError, "scan_3", "scan_1", "scan_2"):
         reel(recorded, capture="scan_3")
 
 
+@pytest.mark.computes
 def test_a_folder_of_images_is_played_by_its_toml(tmp_path: Path):
     write_pattern_folder(tmp_path / "patterns", SEQUENCE)
     toml = tmp_path / "patterns" / "sequence.toml"
@@ -73,23 +75,24 @@ def test_a_folder_of_images_is_played_by_its_toml(tmp_path: Path):
 
 
 def test_folders_that_hold_nothing_are_refused(tmp_path: Path, recorded: Path):
-    with pytest.raises(InputError, match=r"p18.*procam-calibration"):
+    with raises(InputError, "p18", "procam-calibration"):
         reel(tmp_path)
-    with pytest.raises(InputError, match="sequence"):
+    with raises(InputError, "sequence"):
         reel(tmp_path, layout="frames")
-    with pytest.raises(InputError, match="'films'"):
+    with raises(InputError, "'films'"):
         reel(tmp_path, layout="films")  # type: ignore[arg-type]
-    with pytest.raises(SessionError):
+    with raises(SessionError):
         reel(tmp_path, layout="session")
     with Session.create(tmp_path / "empty"):
         pass
-    with pytest.raises(InputError):
+    with raises(InputError, "empty"):
         reel(tmp_path / "empty")
 
 
+@pytest.mark.computes
 def test_the_wizard_captures_what_is_played(recorded: Path, tmp_path: Path):
     with Operator(tmp_path / "session", {"driver": "replay", "source": str(recorded)}) as operator:
-        assert operator.wait_for(lambda s: s.rig.state == "open", 10.0) is not None
+        assert operator.wait_for(lambda s: s.rig.state == "open", 120.0) is not None
         assert operator.choose_target("circles:11x9:14")
         for _ in range(2):
             assert operator.capture_pose()

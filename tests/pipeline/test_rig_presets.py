@@ -4,6 +4,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
+from facts import raises
 
 from slviewer.devices.drivers import Driver, drivers
 from slviewer.errors import DeviceError, InputError
@@ -62,7 +63,7 @@ def test_what_is_saved_comes_back_and_hides_what_is_shipped(session: Session, fa
     assert load_rig("simulated", session)["scale"] == 0.1 and load_rig("simulated")["scale"] == 0.5
     names = [preset.name for preset in presets(session)]
     assert names[:2] == ["bench-1", "simulated"] and names.count("simulated") == 1
-    with pytest.raises(InputError):
+    with raises(InputError, "../bench"):
         save_rig(session, "../bench", BENCH)
     assert Session.open(session.folder).rigs().keys() == {"bench-1", "simulated"}
 
@@ -72,58 +73,58 @@ def test_a_choice_as_toml_is_the_same_choice():
     assert tomllib.loads(to_toml(nothing)) == BENCH
     odd = {"driver": "x", "odd key": "ü", "deep": {"a": {"b": [1, 2.5, -3, "t"]}, "empty": []}, "big": 10**12}
     assert tomllib.loads(to_toml(odd)) == odd
-    with pytest.raises(InputError, match="TOML"):
+    with raises(InputError, "TOML"):
         to_toml({"driver": object()})
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("change", "facts"),
     [
-        ({"settle": 40}, "unknown key 'settle'"),
-        ({"settle_ms": "40"}, "settle_ms = '40' is no number"),
-        ({"settle_ms": float("inf")}, "settle_ms = inf is no number"),
-        ({"focal_px": float("nan")}, "focal_px = nan is no number"),
-        ({"exposure_ms": 0}, "exposure_ms = 0 is no number above 0"),
-        ({"gain": True}, "gain = True is no number"),
-        ({"name": 3}, "name = 3 is no text"),
-        ({"name": "a\u202eb"}, r"name = 'a\\u202eb' is no text"),
-        ({"camera": {"driver": "fake", "source": "0", "monochrome": True}}, "no option 'monochrome': use source, mono"),
-        ({"camera": {"driver": "fake"}}, "needs source"),
-        ({"camera": {"driver": "fale", "source": "0"}}, "no driver is called 'fale': use one of .*fake, .*lacking"),
-        ({"camera": {"driver": "lamp"}}, "the driver lamp offers no camera"),
-        ({"camera": {"source": "0"}}, "names no camera"),
-        ({"projector": "browser"}, "names no projector"),
-        ({"projector": {"driver": "fake", "size": [1, 1], "page": 1}}, "no option 'page'"),
-        ({"driver": "simulated"}, "remove one of both"),
+        ({"settle": 40}, ["'settle'"]),
+        ({"settle_ms": "40"}, ["settle_ms = '40'", "number"]),
+        ({"settle_ms": float("inf")}, ["settle_ms = inf", "number"]),
+        ({"focal_px": float("nan")}, ["focal_px = nan", "number"]),
+        ({"exposure_ms": 0}, ["exposure_ms = 0", "number", "above 0"]),
+        ({"gain": True}, ["gain = True", "number"]),
+        ({"name": 3}, ["name = 3", "text"]),
+        ({"name": "a\u202eb"}, [r"name = 'a\u202eb'", "text"]),
+        ({"camera": {"driver": "fake", "source": "0", "monochrome": True}}, ["'monochrome'", "source", "mono"]),
+        ({"camera": {"driver": "fake"}}, ["fake", "source"]),
+        ({"camera": {"driver": "fale", "source": "0"}}, ["'fale'", "fake", "lacking"]),
+        ({"camera": {"driver": "lamp"}}, ["lamp", "camera"]),
+        ({"camera": {"source": "0"}}, ["[camera]", "driver"]),
+        ({"projector": "browser"}, ["[projector]", "driver"]),
+        ({"projector": {"driver": "fake", "size": [1, 1], "page": 1}}, ["'page'"]),
+        ({"driver": "simulated"}, ["driver", "camera"]),
     ],
 )
-def test_mistakes_are_named(fake: None, change: dict, message: str, tmp_path: Path):
-    with pytest.raises(InputError, match=message):
+def test_mistakes_are_named(fake: None, change: dict, facts: list[str], tmp_path: Path):
+    with raises(InputError, "bench.toml", *facts):
         check_choice({**BENCH, **change}, "bench.toml")
     file = tmp_path / "mine.toml"
     file.write_text(to_toml({**BENCH, **change}))
-    with pytest.raises(InputError, match=r"mine\.toml"):
+    with raises(InputError, "mine.toml", *facts):
         load_rig(file)
 
 
 def test_files_and_names_that_are_none_are_named(fake: None, tmp_path: Path):
     (tmp_path / "broken.toml").write_text("driver = ")
-    for rig, message in (
-        (tmp_path / "broken.toml", "is not TOML"),
-        (tmp_path / "absent.toml", "there is no file"),
-        ("simulatd", "no rig is called 'simulatd': use .*simulated"),
+    for rig, facts in (
+        (tmp_path / "broken.toml", ["broken.toml", "TOML"]),
+        (tmp_path / "absent.toml", ["absent.toml"]),
+        ("simulatd", ["'simulatd'", "simulated"]),
     ):
-        with pytest.raises(InputError, match=message):
+        with raises(InputError, *facts):
             load_rig(rig)
     (tmp_path / "whole.toml").write_text('driver = "simulated"\nscail = 0.5\n')
-    with pytest.raises(InputError, match=r"'scail'.*preset, scale, seed"):
+    with raises(InputError, "'scail'", "preset", "scale", "seed"):
         load_rig(tmp_path / "whole.toml")
 
 
 def test_a_missing_package_says_how_to_install_it(fake: None, tmp_path: Path):
     file = tmp_path / "mine.toml"
     file.write_text(to_toml({**BENCH, "camera": {"driver": "lacking", "source": "0"}}))
-    with pytest.raises(DeviceError, match=r"no_such_package.*pip install"):
+    with raises(DeviceError, "no_such_package", "pip install it"):
         load_rig(file)
 
 

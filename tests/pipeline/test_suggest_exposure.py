@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from facts import missing_facts, raises
 
 from slviewer.devices.protocols import CameraSettings, Rig
 from slviewer.errors import DeviceError, InputError
@@ -105,7 +106,7 @@ def test_a_part_dark_and_shiny_gets_two_exposures():
     # at 1 ms the bright half is saturated, the dark half has a modulation of one grey level
     before = found.state_before
     assert (before[:, 60:] == STATES.index("saturated")).all() and (before[:, :60] == STATES.index("dark")).mean() > 0.9
-    assert f"{short:g} and {long:g} ms" in found.text() and "100.0 %" in found.text()
+    assert not missing_facts(found.text(), f"{short:g}", f"{long:g} ms", "100.0 %")
 
 
 def test_scenes_of_any_range_are_measured_with_four_exposures_at_most():
@@ -136,7 +137,7 @@ def test_only_the_region_counts():
     found = suggest(rig, region=(0, 0, 60, 90))
     assert len(found.exposures_ms) == 1 and 0.5 * 255 < 2.2 * found.exposures_ms[0] + DARK < 255
     for region in ((120, 0, 5, 5), (-1, 0, 5, 5), (0, 0, 0, 5)):
-        with pytest.raises(InputError, match="region"):
+        with raises(InputError, "region", " ".join(map(str, region))):
             suggest(rig, region=region)
 
 
@@ -150,7 +151,7 @@ def test_time_limits_the_exposures_and_raises_the_gain():
     assert sum(hurried.exposures_ms) * frames <= 1000 and hurried.capture_s <= 1.0
     assert hurried.gain > 1 and 0.5 <= hurried.share < free.share
     assert bench.settings() == CameraSettings(1.0, 1.0)
-    with pytest.raises(DeviceError, match="allow more time"):
+    with raises(DeviceError, f"{frames} frames", "0.0001 s"):
         suggest(rig, budget_s=1e-4)
 
 
@@ -160,13 +161,13 @@ def test_a_camera_of_few_exposures_and_one_without():
     assert all(0.5 <= exposure <= 2.0 for exposure in found.exposures_ms)
     assert found.share == pytest.approx(0.5, abs=0.02), "what is saturated at the shortest exposure is said"
     _, rig = make(20.0, reports=False)
-    with pytest.raises(DeviceError, match="by hand"):
+    with raises(DeviceError, "the bench", "exposure"):
         suggest(rig)
 
 
 def test_a_dark_scene_says_so_and_cancelling_restores():
     bench, rig = make(0.0)
-    with pytest.raises(DeviceError, match="no pixel sees the patterns"):
+    with raises(DeviceError, "no pixel"):
         suggest(rig)
     assert bench.settings() == CameraSettings(1.0, 1.0)
     bench, rig = make(60.0)
@@ -174,6 +175,6 @@ def test_a_dark_scene_says_so_and_cancelling_restores():
     def stop(share, doing):
         raise KeyboardInterrupt
 
-    with pytest.raises(KeyboardInterrupt):
+    with raises(KeyboardInterrupt):
         suggest(rig, progress=stop)
     assert bench.settings() == CameraSettings(1.0, 1.0)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
+from facts import missing_facts, raises
 from faulty_rig import breakable
 
 from slviewer.errors import Cancelled, DeviceError, InputError, TurntableError, UsageError
@@ -37,12 +38,13 @@ def calibrated(folder: Path, scale: float = SCALE) -> Path:
 
 
 @pytest.mark.computes
+@pytest.mark.slow
 def test_one_command_makes_a_watertight_mesh_of_a_turned_object(tmp_path: Path, run: Callable[..., Any]) -> None:
     session, rig, out = calibrated(tmp_path / "session"), tmp_path / "rig.toml", tmp_path / "stone.ply"
     rig.write_text(to_toml(RIG))
     status, text, error = run("turn", session, "--rig", rig, "--mesh", out, "--json", tmp_path / "turn.json")
     assert status == 0, error
-    assert "12 scans all round" in text and "watertight" in text and "aligned by features instead" not in error
+    assert not missing_facts(text, "12 scans", "watertight") and "features" not in error
     record = json.loads((tmp_path / "turn.json").read_text())
     assert record["captures"] == {f"turn1_{k + 1:02d}": 30.0 * k for k in range(12)}
     assert "turntable" in {pair["start"] for pair in record["merge"]["registered"]}
@@ -73,9 +75,9 @@ def test_a_plan_is_a_full_turn_or_a_range() -> None:
     assert [step.deg for step in plan_turn("a", 4, -90.0)] == [0.0, -30.0, -60.0, -90.0]
     assert plan_turn("a", 3, -360.0)[-1].deg == -240.0
     for steps, range_deg in ((1, 360.0), (300, 360.0), (12, 0.0), (12, 361.0), (12, float("nan"))):
-        with pytest.raises(InputError):
+        with raises(InputError):
             plan_turn("a", steps, range_deg)
-    with pytest.raises(InputError):
+    with raises(InputError, "../a_12"):
         plan_turn("../a")
 
 
@@ -88,7 +90,7 @@ class Turned:
         self.rig, self.faults = breakable(self.bench.rig)
 
     def set_up(self, choice: Choice, board: object) -> RigSetup:
-        return RigSetup(self.rig, self.bench.world)
+        return RigSetup(self.rig)  # without its world, where the board stays in view: it is quick to render
 
     def __call__(self, progress: Callable[[float, str], None] = lambda share, doing: None, **options: Any) -> Any:
         return turn(
@@ -108,19 +110,20 @@ def turned(tmp_path: Path) -> Turned:
 FOUR = {"turn1_01": 0.0, "turn1_02": 90.0, "turn1_03": 180.0, "turn1_04": 270.0}
 
 
+@pytest.mark.computes
 def test_a_fault_names_its_step_and_the_turn_goes_on_from_there(turned: Turned) -> None:
     turned.faults.plan("turntable", 180)
-    with pytest.raises(TurntableError, match=r"step 3 of 4, at 180 degrees.*alarm 1.*2 scans are saved.*resume"):
+    with raises(TurntableError, "step 3 of 4", "180 degrees", "alarm 1", "2 scans", "resume"):
         turned(steps=4)
     assert list(turned.angles()) == ["turn1_01", "turn1_02"]
     turned.faults.plan("timeout", 3)
-    with pytest.raises(DeviceError, match=r"step 3 of 4.*frame.*2 scans are saved"):
+    with raises(DeviceError, "step 3 of 4", "frame", "2 scans"):
         turned(resume=True)
-    assert turned(resume=True).text().startswith("4 scans all round: turn1_01 to turn1_04")
+    assert not missing_facts(turned(resume=True).text(), "4 scans", "turn1_01", "turn1_04")
     assert turned.angles() == FOUR and turned.warnings == []
-    with pytest.raises(InputError, match="all 4 steps of turn1"):
+    with raises(InputError, "turn1", 4):
         turned(resume=True)
-    with pytest.raises(InputError, match="'turn1_01' already"):
+    with raises(InputError, "'turn1_01'"):
         turned(name="turn1")
     turned(steps=2)
     assert {"turn2_01", "turn2_02"} <= set(turned.angles())
@@ -130,6 +133,7 @@ def test_a_fault_names_its_step_and_the_turn_goes_on_from_there(turned: Turned) 
         assert [step.name for step in missing_steps(store, "turn1")] == ["turn1_02"] and next_turn(store) == "turn3"
 
 
+@pytest.mark.computes
 def test_a_cancelled_turn_keeps_what_was_captured(turned: Turned) -> None:
     seen: list[str] = []
 
@@ -138,7 +142,7 @@ def test_a_cancelled_turn_keeps_what_was_captured(turned: Turned) -> None:
         if "step 3 of 4: frame 2" in doing:
             raise Cancelled("cancelled")
 
-    with pytest.raises(Cancelled):
+    with raises(Cancelled):
         turned(cancel, steps=4)
     assert list(turned.angles()) == ["turn1_01", "turn1_02"] and "step 2 of 4: turning to 90 degrees" in seen
     turned(resume=True)
@@ -191,6 +195,7 @@ def test_angles_that_do_not_fit_the_scans_are_not_insisted_on() -> None:
     assert align_turn(attempt, warnings.append) == "features" and "they do not overlap" in warnings[0]
 
 
+@pytest.mark.computes
 def test_merging_starts_from_stored_angles_of_one_turn_only(turned: Turned) -> None:
     turned(steps=2)
     turned(steps=2)
@@ -198,25 +203,25 @@ def test_merging_starts_from_stored_angles_of_one_turn_only(turned: Turned) -> N
         assert [step.deg for step in recorded_steps(store, "turn2")] == [0.0, 180.0]
         capture = store.load_capture("turn1_01")
         store.save_capture("plain", "scan", capture.sequence, capture.frames, source="x")
-        with pytest.raises(UsageError, match="plain"):
+        with raises(UsageError, "plain"):
             merge(store, ["turn1_01", "plain"], "turn1_01", start="turntable")
-        with pytest.raises(UsageError, match="turn1, turn2"):
+        with raises(UsageError, "turn1", "turn2"):
             merge(store, ["turn1_01", "turn2_02"], "turn1_01", start="turntable")
-        with pytest.raises(UsageError, match="turntable"):
+        with raises(UsageError, "turntable"):
             merge(store, ["turn1_01", "turn1_02"], "turn1_01", angle=30.0)
 
 
 def test_what_cannot_be_turned_is_refused_before_anything_moves(tmp_path: Path) -> None:
     plain = {"driver": "simulated", "scale": 0.05}
     for rig, options, fact in (
-        (plain, {"merge": False}, "no turntable"),
-        (TINY, {}, "no calibration"),
-        (TINY, {"merge": False, "resume": True}, "no turn"),
+        (plain, {"merge": False}, "turntable"),
+        (TINY, {}, "calibration"),
+        (TINY, {"merge": False, "resume": True}, "turn"),
         ({"driver": "replay", "source": "x"}, {"merge": False}, "recording"),
-        (TINY, {"merge": False, "exposure_ms": 1.0, "exposures_ms": (1.0, 2.0)}, "several ways"),
+        (TINY, {"merge": False, "exposure_ms": 1.0, "exposures_ms": (1.0, 2.0)}, "exposure"),
     ):
-        with pytest.raises(InputError, match=fact):
+        with raises(InputError, fact):
             turn(tmp_path / "session", rig, **options)
-    with pytest.raises(UsageError, match="--mesh"):
+    with raises(UsageError, "--mesh"):
         turn(tmp_path / "session", TINY, merge=False, mesh=tmp_path / "a.ply")
     assert not (tmp_path / "session").exists()
