@@ -6,7 +6,8 @@ from functools import partial
 
 import msgspec
 import pytest
-from server_client import CAMERA, announced, settle, until
+from clocks import until
+from server_client import CAMERA, announced, settle
 
 from slviewer.errors import SlviewerError
 from slviewer.server import viser_internals
