@@ -4,6 +4,8 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+from slviewer.preflight.rig_under_test import Clock
+
 HANG_S = 60.0
 """After so long a test that waits for an event has failed: no machine is as slow."""
 
@@ -23,6 +25,11 @@ class SteppingClock:
 
     def __init__(self, step_s: float = 0.0) -> None:
         self._now_s, self._step_s = 1000.0, step_s
+
+    @property
+    def clock(self) -> Clock:
+        """The clock as the preflight takes it."""
+        return Clock(self.now, self.sleep)
 
     def now(self) -> float:
         """Return the time, s, and move on by a step."""

@@ -4,7 +4,6 @@
 rig whose display scales what it is given. With them it is proved that the preflight names what is wrong.
 """
 
-import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -16,6 +15,7 @@ from slviewer.devices.simulated import SimulatedCamera, SimulatedProjector
 from slviewer.devices.world import SimulatedWorld
 from slviewer.errors import InputError
 from slviewer.fringe.sequence import PatternSequence
+from slviewer.preflight.rig_under_test import SYSTEM_CLOCK, Clock
 
 
 @dataclass
@@ -47,12 +47,13 @@ class Imperfections:
 class _Between:
     """What the projector was told and the light has not done yet, and whether the next image repeats the last."""
 
-    def __init__(self) -> None:
+    def __init__(self, clock: Clock) -> None:
+        self.clock = clock
         self.waiting: deque[tuple[float, Callable[[], None]]] = deque()
         self.repeat = False
 
     def act(self, now: float) -> None:
-        """Let all happen that was due by `now`, in s of the monotonic clock."""
+        """Let all happen that was due by `now`, in s of the clock."""
         while self.waiting and self.waiting[0][0] <= now:
             self.waiting.popleft()[1]()
 
@@ -77,11 +78,12 @@ class ImperfectCamera:
     def grab(self, out: np.ndarray) -> None:
         """The image that the imperfections leave of the wrapped camera's."""
         check_frame(self, out)
-        begin = time.monotonic()
+        clock = self._between.clock
+        begin = clock.now()
         if self._wrong.frame_ms > 0:
             period = self._wrong.frame_ms / 1000
             begin = np.ceil(begin / period) * period
-            time.sleep(max(0.0, begin - time.monotonic()))
+            clock.sleep(max(0.0, begin - clock.now()))
         self._between.act(begin)
         if self._between.repeat and self._taken:
             self._between.repeat = False
@@ -92,7 +94,7 @@ class ImperfectCamera:
         self._taken.append(out.copy())
         out[:] = self._taken[max(-len(self._taken), -1 - self._wrong.lag)]
         if self._wrong.frame_ms > 0:
-            time.sleep(max(0.0, begin + self._wrong.frame_ms / 1000 - time.monotonic()))
+            clock.sleep(max(0.0, begin + self._wrong.frame_ms / 1000 - clock.now()))
 
     def settings(self) -> CameraSettings:
         """The wrapped camera's."""
@@ -162,7 +164,7 @@ class ImperfectProjector:
             self._between.act(np.inf)
             action()
         else:
-            self._between.waiting.append((time.monotonic() + self._wrong.latency_ms / 1000, action))
+            self._between.waiting.append((self._between.clock.now() + self._wrong.latency_ms / 1000, action))
 
 
 class _ResamplingProjector(SimulatedProjector):
@@ -182,9 +184,9 @@ class _ResamplingProjector(SimulatedProjector):
         return np.rint(np.interp(u / self._zoom, u, levels)).astype(np.uint8)
 
 
-def imperfect(rig: Rig, wrong: Imperfections | None = None) -> tuple[Rig, Imperfections]:
+def imperfect(rig: Rig, wrong: Imperfections | None = None, clock: Clock = SYSTEM_CLOCK) -> tuple[Rig, Imperfections]:
     """`rig` with devices that lie, and what they lie about."""
-    wrong, between = wrong or Imperfections(), _Between()
+    wrong, between = wrong or Imperfections(), _Between(clock)
     camera, projector = ImperfectCamera(rig.camera, wrong, between), ImperfectProjector(rig.projector, wrong, between)
     return Rig(rig.name, camera, projector, rig.settle_ms), wrong
 
