@@ -24,9 +24,10 @@ def capture(
 ) -> np.ndarray:
     """Capture the frames (n, h, w) of `sequence` with the open rig, into `out` if it is given.
 
-    `sleep(seconds)` waits for the rig's `settle_ms`. `progress(done, n)` is called before the first frame and after each, and may raise (Cancelled) to stop. Raises
-    DeviceError, with the frame at which it happened; whatever is raised, `out` then holds no capture and the rig can be
-    used again once its device answers. The projector is left showing the last frame.
+    `progress(done, n)` is called before the first frame and after each, and may raise (Cancelled) to stop.
+    `sleep(seconds)` waits for the light to settle. Raises DeviceError, with the frame at which it happened; whatever is
+    raised, `out` then holds no capture and the rig can be used again once its device answers. The projector is left
+    showing the last frame.
     """
     with report_driver_faults(rig.projector):
         rig.projector.load(sequence)

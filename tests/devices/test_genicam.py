@@ -156,6 +156,7 @@ def test_mono_is_one_number_a_pixel():
         camera.close()
 
 
+@pytest.mark.computes
 def test_a_capture_of_a_sequence(camera):
     projector = preset_rig(scale=0.05).projector
     sequence = gray(projector.size)

@@ -65,6 +65,7 @@ def test_a_capture_decodes_to_the_truth(world, rig):
         assert abs(error.mean()) < 2e-3
 
 
+@pytest.mark.computes
 def test_frames_arrive_in_place_in_order_and_with_progress(world, rig):
     sequence = p18(PROJECTOR)
     width, height = rig.camera.size
@@ -80,6 +81,7 @@ def test_frames_arrive_in_place_in_order_and_with_progress(world, rig):
         assert np.sqrt(sensor.read_variance) < (seen_frame - frame).std() < np.sqrt(2 * brightest)
 
 
+@pytest.mark.computes
 def test_the_same_captures_have_the_same_noise_previews_or_not(world):
     stacks = []
     for previews in (0, 3):
@@ -112,6 +114,7 @@ def test_light_follows_the_level(rig):
     assert dark < 30 and (grey - dark) / (white - dark) == pytest.approx(128 / 255, rel=0.03)
 
 
+@pytest.mark.computes
 def test_exposure_scales_the_light_and_saturates(world, rig):
     assert rig.camera.settings() == AUTO
     rig.projector.show_level(255)
@@ -127,6 +130,7 @@ def test_exposure_scales_the_light_and_saturates(world, rig):
     assert rig.camera.apply(CameraSettings(exposure_ms=1e5)).exposure_ms == 100.0
 
 
+@pytest.mark.computes
 def test_gain_brings_light_and_noise(world, rig):
     rig.projector.show_level(255)
     spread, mean = {}, {}
@@ -169,6 +173,7 @@ def test_a_draft_shows_the_board_where_it_is_and_captures_are_never_drafts():
         assert abs(seen(rig).astype(float) - full).std() < 4
 
 
+@pytest.mark.computes
 def test_each_thing_keeps_its_place(world, rig):
     rig.projector.show_level(255)
     centre = np.array([5.0, -4.0, 650.0])
@@ -187,6 +192,7 @@ def test_each_thing_keeps_its_place(world, rig):
         world.place("board", Pose(np.eye(3), np.array([0, 0, np.nan])))
 
 
+@pytest.mark.computes
 def test_another_board_can_be_printed(world, rig):
     board = Board.parse("chessboard:9x6:15")
     world.print_board(board, BoardShape(bow_x_mm=0.1))
@@ -261,6 +267,7 @@ def test_wrong_use_is_refused_in_words(world):
         CameraSettings(exposure_ms=-1.0)
 
 
+@pytest.mark.computes
 def test_a_steady_lamp_is_steady_and_a_flickering_one_is_not(world):
     spread = {}
     for flicker in (0.0, 0.02):

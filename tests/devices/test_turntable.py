@@ -230,6 +230,7 @@ def test_impossible_settings_are_refused() -> None:
             make("COM3", **options)
 
 
+@pytest.mark.computes
 def test_the_shipped_rig_has_a_turntable_with_something_to_see_on_it() -> None:
     bench = set_up(load_rig("turntable"), None)
     table, world = bench.rig.turntable, bench.world
