@@ -47,6 +47,7 @@ class Controller:
         self._waiting = False  # for the end of a motion, as M400 does
         self._relative, self._buffer = False, b""
         self._skipped_s, self._skip_once_read_s = 0.0, 0.0
+        self._is_waited_for_in_vain = False
         self._main, self._end = os.openpty()
         tty.setraw(self._end)
         self.port = os.ttyname(self._end)
@@ -90,11 +91,11 @@ class Controller:
                 else:  # the first question is lost
                     booted = True
                     self._send(BANNER if self.dialect == "grbl" else b"start\n")
-                    self._skip_once_read_s = 15.0
+                    self._is_waited_for_in_vain = True
             if self._skip_once_read_s and self._is_read():
                 self.skip(self._skip_once_read_s)
                 self._skip_once_read_s = 0.0
-            if self.fault == "other baud" and self._is_read():
+            if (self.fault == "other baud" or self._is_waited_for_in_vain) and self._is_read():
                 self.skip(1.0)
             self._move()
 
@@ -105,6 +106,7 @@ class Controller:
         return waiting[0] == 0
 
     def _receive(self, data: bytes) -> None:
+        self._is_waited_for_in_vain = False
         for byte in data:
             if self.dialect == "grbl" and byte in b"?!~\x18\x85":
                 self.received.append({0x85: "cancel", 0x18: "reset"}.get(byte, chr(byte)))
@@ -174,7 +176,7 @@ class Controller:
     def _begin_motion(self, units: float, feed: float, state: str) -> bool:
         """Begin to move; whether that is confirmed."""
         if self.fault == "silent":
-            self.skip(1000.0)
+            self._is_waited_for_in_vain = True
             return False
         if self.fault == "slow":
             self.skip(25.0)

@@ -59,7 +59,9 @@ def test_a_sound_capture_is_good(tmp_path: Path, sequence_of: Callable) -> None:
     assert all(0.9 < decoded[axis]["decoded_share"] <= 1 for axis in ("x", "y"))
 
 
-@pytest.mark.parametrize(("wrong", "frame"), [({"swapped": 4}, 5), ({"repeated": frozenset({10})}, 11), ({"lag": 1}, 2)])
+@pytest.mark.parametrize(
+    ("wrong", "frame"), [({"swapped": 4}, 5), ({"repeated": frozenset({10})}, 11), ({"lag": 1}, 2)]
+)
 def test_the_order_is_checked(tmp_path: Path, wrong: dict, frame: int) -> None:
     found = checked(tmp_path / "session", *frames_of(p18, **wrong))
     order = found.check("order")
