@@ -1,15 +1,12 @@
 """Devices that work, and lie: late light, stale, lost and repeated frames, mains light, the wrong screen.
 
 `imperfect(rig)` wraps any rig, and what its `Imperfections` say may change at any time; `resampled_rig` is a simulated
-rig whose display scales what it is given. With them it is proved that the preflight names what is wrong. Their time
-is that of a clock, which a test may move.
+rig whose display scales what it is given. With them it is proved that the preflight names what is wrong.
 """
 
-import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Protocol
 
 import numpy as np
 
@@ -18,23 +15,7 @@ from slviewer.devices.simulated import SimulatedCamera, SimulatedProjector
 from slviewer.devices.world import SimulatedWorld
 from slviewer.errors import InputError
 from slviewer.fringe.sequence import PatternSequence
-
-
-class Clock(Protocol):
-    """Time in s, and waiting for it to pass."""
-
-    def now(self) -> float:
-        """Return the time, s."""
-
-    def sleep(self, seconds: float, /) -> None:
-        """Wait."""
-
-
-class SystemClock:
-    """The time of the machine."""
-
-    now = staticmethod(time.monotonic)
-    sleep = staticmethod(time.sleep)
+from slviewer.preflight.rig_under_test import SYSTEM_CLOCK, Clock
 
 
 @dataclass
@@ -66,7 +47,8 @@ class Imperfections:
 class _Between:
     """What the projector was told and the light has not done yet, and whether the next image repeats the last."""
 
-    def __init__(self) -> None:
+    def __init__(self, clock: Clock) -> None:
+        self.clock = clock
         self.waiting: deque[tuple[float, Callable[[], None]]] = deque()
         self.repeat = False
 
@@ -79,8 +61,8 @@ class _Between:
 class ImperfectCamera:
     """A camera whose images are stale or illuminated by more than the projector."""
 
-    def __init__(self, camera: Camera, wrong: Imperfections, between: _Between, clock: Clock) -> None:
-        self._camera, self._wrong, self._between, self._clock = camera, wrong, between, clock
+    def __init__(self, camera: Camera, wrong: Imperfections, between: _Between) -> None:
+        self._camera, self._wrong, self._between = camera, wrong, between
         self.name, self.size, self.dtype = camera.name, camera.size, camera.dtype
         self._taken: deque[np.ndarray] = deque(maxlen=8)
 
@@ -96,11 +78,12 @@ class ImperfectCamera:
     def grab(self, out: np.ndarray) -> None:
         """The image that the imperfections leave of the wrapped camera's."""
         check_frame(self, out)
-        begin = self._clock.now()
+        clock = self._between.clock
+        begin = clock.now()
         if self._wrong.frame_ms > 0:
             period = self._wrong.frame_ms / 1000
             begin = np.ceil(begin / period) * period
-            self._clock.sleep(max(0.0, begin - self._clock.now()))
+            clock.sleep(max(0.0, begin - clock.now()))
         self._between.act(begin)
         if self._between.repeat and self._taken:
             self._between.repeat = False
@@ -111,7 +94,7 @@ class ImperfectCamera:
         self._taken.append(out.copy())
         out[:] = self._taken[max(-len(self._taken), -1 - self._wrong.lag)]
         if self._wrong.frame_ms > 0:
-            self._clock.sleep(max(0.0, begin + self._wrong.frame_ms / 1000 - self._clock.now()))
+            clock.sleep(max(0.0, begin + self._wrong.frame_ms / 1000 - clock.now()))
 
     def settings(self) -> CameraSettings:
         """The wrapped camera's."""
@@ -136,8 +119,8 @@ class ImperfectCamera:
 class ImperfectProjector:
     """A projector whose light comes late, or not when it should."""
 
-    def __init__(self, projector: Projector, wrong: Imperfections, between: _Between, clock: Clock) -> None:
-        self._projector, self._wrong, self._between, self._clock = projector, wrong, between, clock
+    def __init__(self, projector: Projector, wrong: Imperfections, between: _Between) -> None:
+        self._projector, self._wrong, self._between = projector, wrong, between
         self.name, self.size = projector.name, projector.size
         self._frames = 0
 
@@ -181,7 +164,7 @@ class ImperfectProjector:
             self._between.act(np.inf)
             action()
         else:
-            self._between.waiting.append((self._clock.now() + self._wrong.latency_ms / 1000, action))
+            self._between.waiting.append((self._between.clock.now() + self._wrong.latency_ms / 1000, action))
 
 
 class _ResamplingProjector(SimulatedProjector):
@@ -201,11 +184,10 @@ class _ResamplingProjector(SimulatedProjector):
         return np.rint(np.interp(u / self._zoom, u, levels)).astype(np.uint8)
 
 
-def imperfect(rig: Rig, wrong: Imperfections | None = None, clock: Clock | None = None) -> tuple[Rig, Imperfections]:
-    """`rig` with devices that lie, by this clock (None: the machine's), and what they lie about."""
-    wrong, between, clock = wrong or Imperfections(), _Between(), clock or SystemClock()
-    camera = ImperfectCamera(rig.camera, wrong, between, clock)
-    projector = ImperfectProjector(rig.projector, wrong, between, clock)
+def imperfect(rig: Rig, wrong: Imperfections | None = None, clock: Clock = SYSTEM_CLOCK) -> tuple[Rig, Imperfections]:
+    """`rig` with devices that lie, and what they lie about."""
+    wrong, between = wrong or Imperfections(), _Between(clock)
+    camera, projector = ImperfectCamera(rig.camera, wrong, between), ImperfectProjector(rig.projector, wrong, between)
     return Rig(rig.name, camera, projector, rig.settle_ms), wrong
 
 

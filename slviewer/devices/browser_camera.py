@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 
 from slviewer.devices.opening import Openable
-from slviewer.devices.page_channel import Done, PageChannel, PageConnection
+from slviewer.devices.page_channel import ANSWER_S, Done, PageChannel, PageConnection
 from slviewer.devices.protocols import CameraSettings, Channel, check_frame
 from slviewer.errors import DeviceError, InputError
 
@@ -73,8 +73,8 @@ class CameraChannel(PageChannel[Video]):
     name = "the camera page"
     remedy = "open the camera's link on the phone or laptop whose camera is used"
 
-    def __init__(self) -> None:
-        super().__init__()
+    def __init__(self, answer_s: float = ANSWER_S) -> None:
+        super().__init__(answer_s)
         self._frame_size: tuple[int, int] | None = None
 
     def set_use(self, size: tuple[int, int] | None) -> None:

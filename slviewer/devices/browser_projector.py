@@ -11,7 +11,7 @@ from typing import Any
 import msgspec
 
 from slviewer.devices.opening import Openable
-from slviewer.devices.page_channel import Done, PageChannel, PageConnection
+from slviewer.devices.page_channel import ANSWER_S, Done, PageChannel, PageConnection
 from slviewer.devices.protocols import check_index, check_level, check_sequence
 from slviewer.devices.screen import Screen, refusal
 from slviewer.errors import DeviceError, InputError
@@ -41,8 +41,8 @@ class ProjectorChannel(PageChannel[Screen]):
     name = "the projector page"
     remedy = "open the projector's link on the projector's screen"
 
-    def __init__(self) -> None:
-        super().__init__()
+    def __init__(self, answer_s: float = ANSWER_S) -> None:
+        super().__init__(answer_s)
         self._pattern_size: tuple[int, int] | None = None
         self._light: int | None = None
 

@@ -20,17 +20,19 @@ def capture(
     sequence: PatternSequence,
     out: np.ndarray | None = None,
     progress: Callable[[int, int], None] | None = None,
+    sleep: Callable[[float], None] = time.sleep,
 ) -> np.ndarray:
     """Capture the frames (n, h, w) of `sequence` with the open rig, into `out` if it is given.
 
-    `progress(done, n)` is called before the first frame and after each, and may raise (Cancelled) to stop. Raises
-    DeviceError, with the frame at which it happened; whatever is raised, `out` then holds no capture and the rig can be
-    used again once its device answers. The projector is left showing the last frame.
+    `progress(done, n)` is called before the first frame and after each, and may raise (Cancelled) to stop.
+    `sleep(seconds)` waits for the light to settle. Raises DeviceError, with the frame at which it happened; whatever is
+    raised, `out` then holds no capture and the rig can be used again once its device answers. The projector is left
+    showing the last frame.
     """
     with report_driver_faults(rig.projector):
         rig.projector.load(sequence)
     out = _allocate(rig, len(sequence.frames), out)
-    _capture_loaded(rig, len(sequence.frames), out, progress)
+    _capture_loaded(rig, len(sequence.frames), out, progress, sleep)
     return out
 
 
@@ -47,7 +49,13 @@ def _allocate(rig: Rig, n: int, out: np.ndarray | None) -> np.ndarray:
     return out
 
 
-def _capture_loaded(rig: Rig, n: int, out: np.ndarray, progress: Callable[[int, int], None] | None) -> None:
+def _capture_loaded(
+    rig: Rig,
+    n: int,
+    out: np.ndarray,
+    progress: Callable[[int, int], None] | None,
+    sleep: Callable[[float], None] = time.sleep,
+) -> None:
     """Show and grab the `n` loaded frames into `out` (n, h, w)."""
     if progress is not None:
         progress(0, n)
@@ -55,7 +63,7 @@ def _capture_loaded(rig: Rig, n: int, out: np.ndarray, progress: Callable[[int, 
         try:
             with report_driver_faults(rig.projector):
                 rig.projector.show(k)
-            settle(rig)
+            settle(rig, sleep)
             with report_driver_faults(rig.camera):
                 rig.camera.grab(out[k])
             if k == n - 1:
@@ -166,7 +174,7 @@ def capture_texture(rig: Rig) -> np.ndarray | None:
     return rig.camera.grab_colour()
 
 
-def settle(rig: Rig) -> None:
+def settle(rig: Rig, sleep: Callable[[float], None] = time.sleep) -> None:
     """Wait for the delay between the projector's report and the light on the scene (`settle_ms`)."""
     if rig.settle_ms > 0:
-        time.sleep(rig.settle_ms / 1000)
+        sleep(rig.settle_ms / 1000)

@@ -91,12 +91,14 @@ class GcodeTurntable(Openable):
         limits_deg: Sequence[float] | None = None,
         boot_s: Positive = BOOT_S,
         reply_s: Positive = REPLY_S,
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """The controller at a serial port, such as /dev/ttyUSB0 or COM3.
 
         `degrees_per_unit`: degrees that the table turns for one unit (mm) of the axis, 1 where the controller's steps
         per mm were set to steps per degree; negative to reverse it. `settle_ms` passes after it stands still.
-        `boot_s`, `reply_s`: how long it may take to start, and to accept a command. Raises InputError.
+        `boot_s`, `reply_s`: how long it may take to start, and to accept a command, in seconds of `clock`. Raises
+        InputError.
         """
         if degrees_per_unit == 0:
             raise InputError("degrees_per_unit = 0 turns nothing: give the degrees per unit of the axis")
@@ -106,7 +108,7 @@ class GcodeTurntable(Openable):
         self.limits_deg = None if limits_deg is None else (float(limits_deg[0]), float(limits_deg[1]))
         self._port, self._baud, self._dialect, self._axis = port, baud, dialect, axis
         self._degrees_per_unit, self._speed_deg_s, self._settle_ms = degrees_per_unit, speed_deg_s, settle_ms
-        self._boot_s, self._reply_s = boot_s, reply_s
+        self._boot_s, self._reply_s, self._clock = boot_s, reply_s, clock
         self._serial: Any = None
         self._buffer = b""
         self._unreadable = 0  # bytes that are no text, since it was opened
@@ -156,7 +158,7 @@ class GcodeTurntable(Openable):
         change_deg = deg - self.position_deg()
         units = change_deg / self._degrees_per_unit
         feed = 60.0 * self._speed_deg_s / abs(self._degrees_per_unit)  # units a minute
-        end = time.monotonic() + 2.0 * abs(change_deg) / self._speed_deg_s + _SPARE_S * self._reply_s / REPLY_S
+        end = self._clock() + 2.0 * abs(change_deg) / self._speed_deg_s + _SPARE_S * self._reply_s / REPLY_S
         # Relative to what it counts now: the reported and the commanded angle may have different origins (G92, G54).
         move = f"{self._axis}{units:.4f} F{feed:.2f}"
         try:
@@ -170,7 +172,7 @@ class GcodeTurntable(Openable):
                 self._command(f"$J=G91 G21 {move}")
                 while self._read_grbl()[0] != "Idle":
                     check()
-                    if time.monotonic() > end:
+                    if self._clock() > end:
                         raise TurntableError(f"{self.name} did not reach {deg:g} degrees in time: {_CHECK_TABLE}")
                     time.sleep(_POLL_S)
             reached_deg = self.position_deg()
@@ -186,13 +188,13 @@ class GcodeTurntable(Openable):
 
     def _probe(self) -> Dialect:
         """Ask who is there until the controller answers. Raises TurntableError where it does not, or not readably."""
-        end = time.monotonic() + self._boot_s
-        while time.monotonic() < end:
+        end = self._clock() + self._boot_s
+        while self._clock() < end:
             for question, dialect, answer in (("$I", "grbl", "[VER:"), ("M115", "marlin", "FIRMWARE_NAME")):
                 if self._dialect not in ("auto", dialect):
                     continue
                 self._write(f"{question}\n".encode())
-                until = min(end, time.monotonic() + _ANSWER_S * self._boot_s / BOOT_S)
+                until = min(end, self._clock() + _ANSWER_S * self._boot_s / BOOT_S)
                 while (line := self._read_line(until)) is not None:
                     refused = dialect == "grbl" and line.startswith("error:")  # it is GRBL, but paused
                     if answer in line or refused:
@@ -209,23 +211,23 @@ class GcodeTurntable(Openable):
 
     def _drain(self) -> None:
         """Discard lines until none comes: late answers to earlier questions must not confirm a command."""
-        while self._read_line(time.monotonic() + _QUIET_S) is not None:
+        while self._read_line(self._clock() + _QUIET_S) is not None:
             pass
 
     def _command(self, command: str, end: float | None = None, check: Callable[[], None] = lambda: None) -> None:
         """Send a line, and wait until it is accepted; `check()` is called meanwhile."""
         self._write(f"{command}\n".encode())
-        end = time.monotonic() + self._reply_s if end is None else end
-        while time.monotonic() < end:
+        end = self._clock() + self._reply_s if end is None else end
+        while self._clock() < end:
             check()
-            line = self._read_line(min(end, time.monotonic() + _POLL_S))
+            line = self._read_line(min(end, self._clock() + _POLL_S))
             if line is None:
                 continue
             self._check_line(line, command)
             if line.startswith("ok"):
                 return
             if line.startswith("echo:busy") and command != "M400":  # it says every two seconds that it is alive
-                end = time.monotonic() + self._reply_s
+                end = self._clock() + self._reply_s
         raise TurntableError(
             f"{self.name} did not confirm {command!r} in time: switch it off and on, and check its cable"
         )
@@ -233,7 +235,7 @@ class GcodeTurntable(Openable):
     def _read_grbl(self) -> tuple[str, float]:
         """Ask GRBL for its state and its axis, in units. Raises TurntableError in a state in which it cannot turn."""
         self._write(b"?")
-        end = time.monotonic() + self._reply_s
+        end = self._clock() + self._reply_s
         while (line := self._read_line(end)) is not None:
             if match := re.fullmatch(r"<(\w+)[^|]*\|[MW]Pos:([-\d.,]+)(\|.*)?>", line):
                 state, positions = match[1], match[2].split(",")
@@ -254,7 +256,7 @@ class GcodeTurntable(Openable):
     def _read_marlin(self) -> float:
         """Ask Marlin for the position of the axis, in units."""
         self._write(b"M114\n")
-        end, position = time.monotonic() + self._reply_s, None
+        end, position = self._clock() + self._reply_s, None
         while (line := self._read_line(end)) is not None:
             self._check_line(line, "M114")
             match = re.search(rf"(?<!\w){self._axis}:\s*(-?\d+(?:\.\d+)?)", line.split("Count")[0])
@@ -286,8 +288,8 @@ class GcodeTurntable(Openable):
         """Stop a motion, as far as the controller still listens: it must not turn on unattended."""
         try:
             self._write(b"M410\n" if self._is_marlin else b"\x85")
-            end = time.monotonic() + _STOP_S
-            while not self._is_marlin and time.monotonic() < end and self._read_grbl()[0] != "Idle":
+            end = self._clock() + _STOP_S
+            while not self._is_marlin and self._clock() < end and self._read_grbl()[0] != "Idle":
                 time.sleep(_POLL_S)
             self._drain()
         except TurntableError:  # what made it stop is reported
@@ -301,7 +303,7 @@ class GcodeTurntable(Openable):
             raise self._describe_loss(error) from error
 
     def _read_line(self, end: float) -> str | None:
-        """Return the next line without its end; None where none is complete at `end`, s of the monotonic clock."""
+        """Return the next line without its end; None where none is complete at `end`, s of the clock."""
         while True:
             line, newline, rest = self._buffer.partition(b"\n")
             if newline:
@@ -313,7 +315,7 @@ class GcodeTurntable(Openable):
                 continue
             if len(self._buffer) > 4096:  # no controller sends such lines
                 self._unreadable, self._buffer = self._unreadable + len(self._buffer), b""
-            if time.monotonic() >= end:
+            if self._clock() >= end:
                 return None
             try:
                 self._buffer += self._serial.read(max(1, self._serial.in_waiting))

@@ -49,9 +49,18 @@ class PageState:
 class PageConnection(Generic[Facts]):
     """One connection of a page. The device's thread sends requests, the server's stores the answers."""
 
-    def __init__(self, condition: threading.Condition, name: str, window: str, facts: Facts, send: Send) -> None:
+    def __init__(
+        self,
+        condition: threading.Condition,
+        name: str,
+        window: str,
+        facts: Facts,
+        send: Send,
+        answer_s: float = ANSWER_S,
+    ) -> None:
         self.window, self.facts = window, facts
         self.send = send
+        self.answer_s = answer_s
         self.changes = 0  # of what it reported since it connected
         self.refused, self.gone = "", ""
         self.published: Any = None
@@ -59,11 +68,13 @@ class PageConnection(Generic[Facts]):
         self._number = 0
         self._answer: tuple[Done, bytes] | None = None
 
-    def request(self, op: str, payload: bytes = b"", timeout_s: float = ANSWER_S, **fields: Any) -> bytes:
+    def request(self, op: str, payload: bytes = b"", timeout_s: float | None = None, **fields: Any) -> bytes:
         """Send a request, wait until the page reports it done, and return what came with the answer.
 
-        Raises DeviceError within `timeout_s`.
+        Raises DeviceError within `timeout_s`, None: within `answer_s`.
         """
+        if timeout_s is None:
+            timeout_s = self.answer_s
         with self._condition:
             self._number += 1
             self.check()
@@ -102,8 +113,9 @@ class PageChannel(ABC, Generic[Facts]):
     remedy: str
     """What to do where no page is connected."""
 
-    def __init__(self) -> None:
+    def __init__(self, answer_s: float = ANSWER_S) -> None:
         self._condition = threading.Condition()
+        self._answer_s = answer_s
         self._page: PageConnection[Facts] | None = None
 
     # what kinds of pages differ in
@@ -176,7 +188,7 @@ class PageChannel(ABC, Generic[Facts]):
                     else f"another window was made {self.name}",
                 )
                 before.send(None)
-            page = self._page = PageConnection(self._condition, self.name, window, facts, send)
+            page = self._page = PageConnection(self._condition, self.name, window, facts, send, self._answer_s)
             self._publish_state()
             return page
 

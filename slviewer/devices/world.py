@@ -2,6 +2,7 @@
 
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
@@ -25,7 +26,8 @@ a table, a plate with coded markers, and three surfaces that light themselves.""
 
 _INITIAL_DEPTHS_MM = {"board": 600.0, "plane": 600.0, "sphere": 690.0, "object": 600.0, "marked": 600.0}
 _INITIAL_DEPTHS_MM |= dict.fromkeys(CONCAVE, 640.0)
-_SETTLED_S = 0.3  # a thing that has not been moved for so long is rendered in full by a preview too
+SETTLED_S = 0.3
+"""A thing that has not been moved for so long is rendered in full by a preview too."""
 _DRAFT_SCALE = 0.25  # of a preview while things move: the geometry of 400x300 rays instead of 1600x1200
 
 
@@ -49,8 +51,15 @@ class SimulatedWorld:
     origin is its first feature, the plane's its middle, the sphere's its centre, the object's its own.
     """
 
-    def __init__(self, rig: SimulatedRig, board: Board | None = None, shape: BoardShape = FLAT) -> None:
+    def __init__(
+        self,
+        rig: SimulatedRig,
+        board: Board | None = None,
+        shape: BoardShape = FLAT,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
         self.rig = rig
+        self._clock = clock
         self.shown = Shown((None, np.zeros(rig.projector.size[0], np.uint8)), 1.0, (rig.seed,), True)
         self._draft_rig = replace(rig, camera=replace(rig.camera, scale=min(rig.camera.scale, _DRAFT_SCALE)))
         self._lock = threading.RLock()
@@ -60,7 +69,7 @@ class SimulatedWorld:
         }
         self._standing: Thing = "board"
         self._table_deg = 0.0
-        self._moved = time.monotonic()
+        self._moved = self._clock()
         self._renderers: dict[bool, Renderer] = {}
         self.print_board(board or Board.parse("circles:21x16:9"), shape)
 
@@ -146,7 +155,7 @@ class SimulatedWorld:
     def renderer(self, preview: bool) -> Renderer:
         """Return a renderer of the scene; for previews soon after a motion, one of a smaller camera scale."""
         with self._lock:
-            draft = preview and time.monotonic() - self._moved < _SETTLED_S
+            draft = preview and self._clock() - self._moved < SETTLED_S
             draft = draft and self._draft_rig.camera.scale < self.rig.camera.scale
             if draft not in self._renderers:
                 self._renderers[draft] = Renderer(self._draft_rig if draft else self.rig, self._things[self._standing])
@@ -157,7 +166,7 @@ class SimulatedWorld:
         with self._lock:
             self._things[thing] = scene
             if thing == self._standing:
-                self._moved = time.monotonic()
+                self._moved = self._clock()
                 self._renderers.clear()
 
     def _get_board_scene(self) -> BoardScene:

@@ -1,6 +1,5 @@
 """The preflight without a browser: is a rig fit to capture with, and is a capture fit to measure with?"""
 
-import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -17,7 +16,7 @@ from slviewer.preflight.latency import measure_latency
 from slviewer.preflight.light import capture_burst, check_ambient, check_exposure, check_flicker, check_gamma
 from slviewer.preflight.order import check_order
 from slviewer.preflight.recorded_capture import preflight_capture
-from slviewer.preflight.rig_under_test import RigUnderTest
+from slviewer.preflight.rig_under_test import SYSTEM_CLOCK, Clock, RigUnderTest
 from slviewer.preflight.screen import check_pixels, check_screen
 from slviewer.preflight.stillness import check_motion
 from slviewer.preflight.turntable import check_turntable
@@ -89,14 +88,20 @@ _CHECK_ORDER: tuple[CheckName, ...] = (
 )
 
 
-def preflight(rig: Rig, *, say: Callable[[str], None] | None = None, progress: Progress | None = None) -> Preflight:
+def preflight(
+    rig: Rig,
+    *,
+    say: Callable[[str], None] | None = None,
+    progress: Progress | None = None,
+    clock: Clock = SYSTEM_CLOCK,
+) -> Preflight:
     """Check an open rig, on the thread that owns its devices; about 10 s.
 
     `say` receives one sentence for each check. `progress` may raise Cancelled. Raises DeviceError where a
     device does not answer. Patterns are loaded and light is shown; what was loaded and shown before is for the caller
     to restore.
     """
-    began, shown = time.monotonic(), 0
+    began, shown = clock.now(), 0
     checks: list[Check] = []
     heard = progress or ignore_progress
 
@@ -113,7 +118,7 @@ def preflight(rig: Rig, *, say: Callable[[str], None] | None = None, progress: P
             if say is not None:
                 say(check.sentence if not check.remedy else f"{check.sentence} {check.remedy}")
 
-    bench = RigUnderTest(rig, tick)
+    bench = RigUnderTest(rig, tick, clock)
     bench.measure_references()
     delay, settle_ms = measure_latency(bench)
     if settle_ms is None:
@@ -127,7 +132,7 @@ def preflight(rig: Rig, *, say: Callable[[str], None] | None = None, progress: P
         unseen = "It was not looked at, because the camera does not see what the projector is given to show."
         rest = [name for name in _CHECK_ORDER if name not in {check.name for check in checks}]
         checks += [Check(name, "unknown", unseen, "", {}) for name in rest]
-        return Preflight(tuple(checks), None, None, None, time.monotonic() - began)
+        return Preflight(tuple(checks), None, None, None, clock.now() - began)
     add(screen, delay)
     right, exposure_ms = check_exposure(bench)
     add(right)
@@ -141,4 +146,4 @@ def preflight(rig: Rig, *, say: Callable[[str], None] | None = None, progress: P
         tick("turning the turntable")
         add(check_turntable(rig.turntable))
     heard(1.0, "checked")
-    return Preflight(tuple(checks), settle_ms, levels, exposure_ms, time.monotonic() - began)
+    return Preflight(tuple(checks), settle_ms, levels, exposure_ms, clock.now() - began)

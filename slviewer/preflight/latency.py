@@ -1,7 +1,6 @@
 """Delay from the projector's change to the camera's image, and whether its images are fresh."""
 
 import math
-import time
 from dataclasses import dataclass
 
 import numpy as np
@@ -98,9 +97,9 @@ def measure_latency(bench: RigUnderTest) -> tuple[Check, float | None]:
 def _time_change(bench: RigUnderTest, i: int) -> _Change:
     """One change from dark to white or back; each begins at another moment of the camera's own clock."""
     target = 0.0 if i % 2 == 0 else 1.0  # the references leave it white
-    time.sleep(bench.frame_ms / 1000 * i / _CHANGE_COUNT)
+    bench.clock.sleep(bench.frame_ms / 1000 * i / _CHANGE_COUNT)
     bench.show(255 if target else None, "delay of the light")
-    shown, begin_s = time.monotonic(), []
+    shown, begin_s = bench.clock.now(), []
     while True:
         start, image = bench.grab_timed()
         begin_s.append(start - shown)
@@ -114,7 +113,7 @@ def _count_stale(bench: RigUnderTest, settle_ms: float, i: int) -> int:
     """Number of images that still show the old light after a sufficiently long wait."""
     target = 0.0 if i % 2 == 0 else 1.0
     bench.show(255 if target else None, "freshness of the images")
-    time.sleep((2 * settle_ms + bench.frame_ms) / 1000)
+    bench.clock.sleep((2 * settle_ms + bench.frame_ms) / 1000)
     old = 0
     while old < 8 and abs(bench.share(bench.grab(), bench.illuminated) - target) >= _compute_tolerance(bench):
         old += 1

@@ -31,7 +31,7 @@ def check_order(bench: RigUnderTest) -> tuple[Check, Check]:
     sequence = PatternSequence(projector, frames, full_scale=stated_full_scale(bench.rig.camera))
     bench.show(None, "order of the frames")
     bench.wait()
-    stack = capture(replace(bench.rig, settle_ms=bench.settle_ms), sequence)
+    stack = capture(replace(bench.rig, settle_ms=bench.settle_ms), sequence, sleep=bench.clock.sleep)
     return _judge_order(bench, sequence, stack), check_repeats(sequence, stack)
 
 

@@ -3,6 +3,7 @@
 import math
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -19,6 +20,17 @@ _SPREAD_S = 0.01  # one period of 100 Hz, over which images begin: at an even pa
 _GOLDEN = 0.618034
 
 
+@dataclass(frozen=True)
+class Clock:
+    """Time in seconds that never runs backwards, and how to wait."""
+
+    now: Callable[[], float] = time.monotonic
+    sleep: Callable[[float], None] = time.sleep
+
+
+SYSTEM_CLOCK = Clock()
+
+
 class RigUnderTest:
     """An open rig. Images come as (h, w) float32 grey levels of every `stride`-th row and column.
 
@@ -27,8 +39,8 @@ class RigUnderTest:
     ``noise`` of one grey level, and ``unsteady``, by how much whole images differ, as a share of the white light (rms).
     """
 
-    def __init__(self, rig: Rig, tick: Callable[[str], None]) -> None:
-        self.rig, self._tick = rig, tick
+    def __init__(self, rig: Rig, tick: Callable[[str], None], clock: Clock = SYSTEM_CLOCK) -> None:
+        self.rig, self._tick, self.clock = rig, tick, clock
         width, height = rig.camera.size
         self._frame = np.empty((height, width), rig.camera.dtype)
         self.stride = max(1, math.ceil(math.sqrt(width * height / _PIXELS)))
@@ -47,15 +59,15 @@ class RigUnderTest:
         return self._frame[:: self.stride, :: self.stride].astype(np.float32)
 
     def grab_timed(self) -> tuple[float, np.ndarray]:
-        """The start time of grabbing, s of the monotonic clock, and the image (h, w), sampled."""
-        start_s = time.monotonic()
+        """The start time of grabbing, s of the clock, and the image (h, w), sampled."""
+        start_s = self.clock.now()
         return start_s, self.grab()
 
     def grab_spread(self, count: int) -> tuple[np.ndarray, np.ndarray]:
         """Start times (n,) s and images (n, h, w) of the next ``count`` images, spread over the mains period."""
         timed = []
         for k in range(count):
-            time.sleep(_SPREAD_S * (k * _GOLDEN % 1))
+            self.clock.sleep(_SPREAD_S * (k * _GOLDEN % 1))
             timed.append(self.grab_timed())
         start_s, images = zip(*timed, strict=True)
         return np.array(start_s), np.stack(images)
@@ -79,7 +91,7 @@ class RigUnderTest:
 
     def wait(self) -> None:
         """Wait until the light has settled, and discard images that are older."""
-        time.sleep(self.settle_ms / 1000)
+        self.clock.sleep(self.settle_ms / 1000)
         for _ in range(self.stale):
             self.grab()
 
@@ -88,11 +100,11 @@ class RigUnderTest:
         bursts = []
         for grey, doing in ((None, "dark"), (255, "white light")):
             self.show(grey, doing)
-            end, passed = time.monotonic() + _SETTLE_S, 0
-            while time.monotonic() < end or passed < _DISCARDED_GRABS:
+            end, passed = self.clock.now() + _SETTLE_S, 0
+            while self.clock.now() < end or passed < _DISCARDED_GRABS:
                 self.grab()
                 passed += 1
-                time.sleep(max(0.0, min(0.02, end - time.monotonic())))
+                self.clock.sleep(max(0.0, min(0.02, end - self.clock.now())))
             bursts.append(self.grab_spread(_MEAN)[1])
         dark, white = bursts
         self.dark, self.white = dark.mean(axis=0), white.mean(axis=0)

@@ -12,10 +12,12 @@ from websockets.http11 import Response
 
 from slviewer.server.access import Role
 
-REQUEST_SECONDS = 10
+REQUEST_SECONDS = 10.0
+"""How long a browser may take to send its request."""
 REQUEST_BYTES = 32_768
 """Of a request with all its headers; browsers send a tenth of it."""
-STALL_SECONDS = 30
+STALL_SECONDS = 30.0
+"""How long the reader of a file may take nothing of it."""
 CHUNK = 2**17
 """Bytes; after the last chunk is written, a slow reader has ten seconds for it."""
 
@@ -30,6 +32,12 @@ class Connection(ServerConnection):
     """What a message becomes on its way in; None drops it."""
     _request_bytes = 0
 
+    def __init__(
+        self, *args: Any, request_s: float = REQUEST_SECONDS, stall_s: float = STALL_SECONDS, **options: Any
+    ) -> None:
+        super().__init__(*args, **options)
+        self._request_s, self._stall_s = request_s, stall_s
+
     def data_received(self, data: bytes) -> None:
         """As websockets, but a request that is too long ends the connection before it takes up memory."""
         if self.request is None:
@@ -43,7 +51,7 @@ class Connection(ServerConnection):
         """As websockets, whose own limit would cut a long download too: here it covers the request alone."""
         await asyncio.wait(
             [self.request_rcvd, self.connection_lost_waiter],
-            timeout=REQUEST_SECONDS,
+            timeout=self._request_s,
             return_when=asyncio.FIRST_COMPLETED,
         )
         if self.request is None:
@@ -64,18 +72,18 @@ class Connection(ServerConnection):
         """Send an answer whose body is this open file, chunk by chunk; returns what process_request must return.
 
         The reader's pace is kept, so that a file of any size takes one chunk of memory. A reader who takes nothing for
-        STALL_SECONDS, or a server that stops, ends it.
+        ``stall_s``, or a server that stops, ends it.
         """
         tail: bytes = b"HTTP/1.1 200 OK\r\n" + headers.serialize()
         try:
-            async with asyncio.timeout(STALL_SECONDS) as limit:
+            async with asyncio.timeout(self._stall_s) as limit:
                 while chunk := await asyncio.to_thread(file.read, CHUNK):
                     if self.transport.is_closing() or not self.server.is_serving():
                         raise TimeoutError
                     self.transport.write(tail)
                     await self.drain()
                     tail = chunk
-                    limit.reschedule(asyncio.get_running_loop().time() + STALL_SECONDS)
+                    limit.reschedule(asyncio.get_running_loop().time() + self._stall_s)
         except (TimeoutError, OSError):
             # The answer has begun, so there is no other to give; a cancelled handshake ends the connection silently.
             self.transport.abort()

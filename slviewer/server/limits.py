@@ -7,6 +7,7 @@ import socket
 import sys
 import time
 from collections import Counter
+from collections.abc import Callable, Mapping
 from http import HTTPStatus
 from typing import Any
 
@@ -32,8 +33,9 @@ class Listener(socket.socket):
     address that has most of them. What is handed out counts as a stranger's until `admit` is called for its address.
     """
 
-    def __init__(self, *args: Any, **options: Any) -> None:
+    def __init__(self, *args: Any, strangers: int = STRANGERS, **options: Any) -> None:
         super().__init__(*args, **options)
+        self._max_strangers = strangers
         self._strangers: dict[Any, _Accepted] = {}
         self._counts = Counter[str]()
         self._closing: dict[Any, float] = {}
@@ -84,7 +86,7 @@ class Listener(socket.socket):
     def _make_room(self) -> None:
         """Close the oldest connection of the busiest address where there are too many."""
         busiest, count = self._counts.most_common(1)[0]
-        if count <= STRANGERS_PER_ADDRESS and len(self._strangers) <= STRANGERS:
+        if count <= STRANGERS_PER_ADDRESS and len(self._strangers) <= self._max_strangers:
             return
         oldest = self._remove(next(peer for peer, one in self._strangers.items() if one.group == busiest))
         assert oldest is not None
@@ -111,15 +113,15 @@ class _Accepted(socket.socket):
 
 
 class Admissions:
-    """The connections with a valid cookie, by role. Only for the server's own thread."""
+    """The connections with a valid cookie, by role, at most ``limits``. Only for the server's own thread."""
 
-    def __init__(self, listener: socket.socket) -> None:
-        self._listener = listener
-        self._connections: dict[Role, set[Any]] = {role: set() for role in CONNECTIONS}
+    def __init__(self, listener: socket.socket, limits: Mapping[Role, int] = CONNECTIONS) -> None:
+        self._listener, self._limits = listener, limits
+        self._connections: dict[Role, set[Any]] = {role: set() for role in limits}
 
     def admit(self, connection: Any, role: Role) -> None:
         """Count a connection (with `transport` and `role`) among those of a role; raises Refusal for one too many."""
-        if len(self._connections[role]) >= CONNECTIONS[role]:
+        if len(self._connections[role]) >= self._limits[role]:
             raise Refusal(HTTPStatus.SERVICE_UNAVAILABLE, "Too many pages are open by this link: close some of them.")
         if isinstance(self._listener, Listener):
             self._listener.admit(connection.transport.get_extra_info("peername"))
@@ -138,13 +140,14 @@ class Admissions:
 class OncePerSecond(logging.Filter):
     """Drops a log record where one of the same message and error was logged within the last second."""
 
-    def __init__(self) -> None:
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         super().__init__()
+        self._clock = clock
         self._times: dict[Any, float] = {}
 
     def filter(self, record: logging.LogRecord) -> bool:
         """Return whether the record is logged."""
-        now = time.monotonic()
+        now = self._clock()
         error = record.exc_info[0] if record.exc_info else None
         fault = record.name, record.levelno, str(record.msg)[:200], error
         if now - self._times.get(fault, float("-inf")) < 1.0:

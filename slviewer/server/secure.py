@@ -2,8 +2,9 @@
 
 import ipaddress
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +17,11 @@ from slviewer.server import viser_internals
 from slviewer.server.access import Access, Role
 from slviewer.server.auth_middleware import AuthMiddleware, DevicePage
 from slviewer.server.binding import listen, network_address
-from slviewer.server.connection import REQUEST_SECONDS, Connection, quiet_logger
+from slviewer.server.connection import REQUEST_SECONDS, STALL_SECONDS, Connection, quiet_logger
 from slviewer.server.credentials import Certificate, load_tokens, save_tokens, self_made_certificate
 from slviewer.server.downloads import Downloads
 from slviewer.server.gate import ViserGate
-from slviewer.server.limits import Admissions, limit_log, raise_descriptor_limit
+from slviewer.server.limits import CONNECTIONS, Admissions, limit_log, raise_descriptor_limit
 from slviewer.server.responses import script_hash
 from slviewer.server.uploads import UploadBudget
 
@@ -145,8 +146,19 @@ class SafeServer:
         return f"[{address}]" if address.version == 6 else str(address)
 
 
-def serve(serving: Serving, *, label: str | None = None, upload_limit: int = 256 * 10**6) -> SafeServer:
+def serve(
+    serving: Serving,
+    *,
+    label: str | None = None,
+    upload_limit: int = 256 * 10**6,
+    request_s: float = REQUEST_SECONDS,
+    stall_s: float = STALL_SECONDS,
+    connections: Mapping[Role, int] = CONNECTIONS,
+) -> SafeServer:
     """Start the server of viser's page. `upload_limit` bounds the bytes of all unfinished uploads.
+
+    A browser has `request_s` to send its request, and the reader of a file `stall_s` to take some of it; `connections`
+    bounds the open ones by role.
 
     Raises SlviewerError within two seconds where the address can't be served, where viser is not the pinned one, and
     where tokens or certificate cannot be used.
@@ -165,7 +177,7 @@ def serve(serving: Serving, *, label: str | None = None, upload_limit: int = 256
     address, port = sock.getsockname()[:2]
     try:
         access = Access(port, tokens, serving.names, tls=certificate is not None)
-        admissions = Admissions(sock)
+        admissions = Admissions(sock, connections)
         device_pages: dict[Role, DevicePage] = {}
         downloads = Downloads()
         scripts = (*viser_internals.VISER_SCRIPTS, script_hash(viser_internals.PAGE_SCRIPT))
@@ -200,7 +212,7 @@ def serve(serving: Serving, *, label: str | None = None, upload_limit: int = 256
             options.update(
                 sock=sock,
                 process_request=middleware.answer,
-                create_connection=Connection,
+                create_connection=partial(Connection, request_s=request_s, stall_s=stall_s),
                 max_size=MESSAGE_LIMIT,
                 server_header=None,
                 backlog=1024,  # of a crowd: a browser whose request does not fit in tries again after a second
@@ -208,7 +220,7 @@ def serve(serving: Serving, *, label: str | None = None, upload_limit: int = 256
                 logger=quiet_logger(),
             )
             if context is not None:
-                options.update(ssl=context, ssl_handshake_timeout=REQUEST_SECONDS)
+                options.update(ssl=context, ssl_handshake_timeout=request_s)
             return serve_websockets(handle, **options)
 
         server = viser_internals.start(serve_viser, address, port, label)

@@ -21,8 +21,10 @@ class Viewers:
     own, whenever one has caught up, and must return at once.
     """
 
-    def __init__(self, server: viser.ViserServer, answered: Callable[[], None]) -> None:
-        self._server, self._answered = server, answered
+    def __init__(
+        self, server: viser.ViserServer, answered: Callable[[], None], clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._server, self._answered, self._clock = server, answered, clock
         self._lock = threading.Lock()
         self._request_times: dict[int, float] = {}
         self._durations: dict[int, float] = {}
@@ -44,12 +46,12 @@ class Viewers:
         """Mark that something was sent to this client: it is not ready until it has drawn it."""
         number = client.client_id
         with self._lock:
-            self._request_times[number] = time.monotonic()
+            self._request_times[number] = self._clock()
         viser_internals.request_answer(client, lambda: self._record_answer(number))
 
     def slowest_s(self) -> float:
         """Time, s, that the slowest client took to draw its last update, stalled ones excluded; 0 if there is none."""
-        now = time.monotonic()
+        now = self._clock()
         with self._lock:
             waiting = [now - sent_s for sent_s in self._request_times.values() if now - sent_s < STALLED_S]
             return max([*self._durations.values(), *waiting], default=0.0)
@@ -59,5 +61,5 @@ class Viewers:
         with self._lock:
             sent_s = self._request_times.pop(number, None)
             if sent_s is not None:
-                self._durations[number] = min(time.monotonic() - sent_s, STALLED_S)
+                self._durations[number] = min(self._clock() - sent_s, STALLED_S)
         self._answered()

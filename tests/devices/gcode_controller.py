@@ -1,8 +1,11 @@
 """A controller at a pseudo-terminal that speaks GRBL 1.1 or Marlin, with faults."""
 
+import array
+import fcntl
 import os
 import re
 import select
+import termios
 import threading
 import time
 import tty
@@ -30,7 +33,10 @@ BANNER = b"\r\nGrbl 1.1h ['$' for help]\r\n"
 
 
 class Controller:
-    """Turns nothing, but counts as if; `received` holds the lines and real-time bytes that came."""
+    """Turns nothing, but counts as if; `received` holds the lines and real-time bytes that came.
+
+    A driver that uses `clock` waits for nothing that will not come: the time is over as soon as it would be in vain.
+    """
 
     def __init__(self, dialect: Literal["grbl", "marlin"] = "grbl", fault: Fault = "") -> None:
         self.fault, self.dialect = fault, dialect
@@ -40,7 +46,8 @@ class Controller:
         self._state = {"locked": "Alarm", "paused": "Hold:0"}.get(fault, "Idle")
         self._waiting = False  # for the end of a motion, as M400 does
         self._relative, self._buffer = False, b""
-        self._born = time.monotonic()
+        self._skipped_s, self._skip_once_read_s = 0.0, 0.0
+        self._is_waited_for_in_vain = False
         self._main, self._end = os.openpty()
         tty.setraw(self._end)
         self.port = os.ttyname(self._end)
@@ -56,6 +63,19 @@ class Controller:
         self._thread.join(2.0)
         self._unplug()
 
+    def clock(self) -> float:
+        """Return the time, s."""
+        return time.monotonic() + self._skipped_s
+
+    def skip(self, seconds: float) -> None:
+        """Let time pass."""
+        self._skipped_s += seconds
+
+    @property
+    def is_stuck(self) -> bool:
+        """Whether it is blocked half of the way."""
+        return self.fault == "stuck" and self.is_moving and self.position >= (self._begin + self._target) / 2
+
     @property
     def is_moving(self) -> bool:
         """Whether it turns."""
@@ -64,16 +84,29 @@ class Controller:
     def _serve(self) -> None:
         booted = self.fault != "boots"
         while not self._closing and self._main >= 0:
-            if not booted and time.monotonic() > self._born + 0.4:
-                booted = True
-                self._send(BANNER if self.dialect == "grbl" else b"start\n")
             if select.select([self._main], [], [], 0.005)[0]:
                 data = os.read(self._main, 256)
                 if booted:
                     self._receive(data)
+                else:  # the first question is lost
+                    booted = True
+                    self._send(BANNER if self.dialect == "grbl" else b"start\n")
+                    self._is_waited_for_in_vain = True
+            if self._skip_once_read_s and self._is_read():
+                self.skip(self._skip_once_read_s)
+                self._skip_once_read_s = 0.0
+            if (self.fault == "other baud" or self._is_waited_for_in_vain) and self._is_read():
+                self.skip(1.0)
             self._move()
 
+    def _is_read(self) -> bool:
+        """Whether all that was sent has been read."""
+        waiting = array.array("i", [0])
+        fcntl.ioctl(self._end, termios.FIONREAD, waiting)
+        return waiting[0] == 0
+
     def _receive(self, data: bytes) -> None:
+        self._is_waited_for_in_vain = False
         for byte in data:
             if self.dialect == "grbl" and byte in b"?!~\x18\x85":
                 self.received.append({0x85: "cancel", 0x18: "reset"}.get(byte, chr(byte)))
@@ -137,13 +170,16 @@ class Controller:
             self._send(b"ok\n")
         else:
             self._send(f'echo:Unknown command: "{line}"\nok\n'.encode())
+            if line == "$I":
+                self._skip_once_read_s = 5.0
 
     def _begin_motion(self, units: float, feed: float, state: str) -> bool:
         """Begin to move; whether that is confirmed."""
         if self.fault == "silent":
+            self._is_waited_for_in_vain = True
             return False
         if self.fault == "slow":
-            time.sleep(0.25)
+            self.skip(25.0)
         self._begin, self._target = self.position, self.position + units
         self._begun, self._duration, self._state = time.monotonic(), 60.0 * abs(units) / feed, state
         return True

@@ -13,7 +13,8 @@ import numpy as np
 class NetworkCamera(ThreadingHTTPServer):
     """Looks at `picture`, (h, w) or (h, w, 3) BGR, `fps` times a second, and sends `clump` pictures at a time.
 
-    Once it was told to `take` pictures, it sends each of these instead, when it is taken.
+    Once it was told to `take` pictures, it sends each of these instead, when it is taken. `sent` counts the
+    pictures that it has sent, or is about to.
     """
 
     daemon_threads = True
@@ -26,6 +27,7 @@ class NetworkCamera(ThreadingHTTPServer):
         self.going.set()
         self.dead = False
         self.taken = 0
+        self.sent = 0
         self._shutter = threading.Condition()
         self._thread = threading.Thread(target=self.serve_forever, kwargs={"poll_interval": 0.02}, daemon=True)
         self._thread.start()
@@ -79,6 +81,7 @@ class _Sender(BaseHTTPRequestHandler):
             head = f"--picture\r\nContent-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n\r\n".encode()
             clump += head + jpeg + b"\r\n"
             sent += 1
+            self.server.sent += 1
             due = max(due + 1 / self.server.fps, time.monotonic() - 0.1)
             time.sleep(max(0.0, due - time.monotonic()))
             self.server.going.wait()

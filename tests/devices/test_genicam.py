@@ -13,6 +13,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from clocks import HANG_S, until
+from facts import raises
 
 genicam = pytest.importorskip("genicam", reason="the optional package genicam is not installed")
 pytest.importorskip("harvesters", reason="the optional package harvesters is not installed")
@@ -57,6 +59,12 @@ def grabbed(camera: GenicamCamera) -> np.ndarray:
     return out
 
 
+def fill_buffers(camera: GenicamCamera) -> None:
+    """Wait until no buffer of the camera is left empty."""
+    acquirer = camera._link._acquirer
+    assert until(lambda: acquirer.data_streams[0].num_awaiting_delivery == acquirer.num_buffers)
+
+
 def column(frame: np.ndarray) -> float:
     """Where the square is; it starts at the left and turns back at the right."""
     assert (frame == 0).sum() == 400 and set(np.unique(frame)) == {0, 255}
@@ -66,9 +74,9 @@ def column(frame: np.ndarray) -> float:
 def test_cameras_are_found_and_chosen():
     assert list_connected() == [f"Machine Vision Games Ltd. Viky, serial {k}" for k in range(3)]
     assert driver("genicam").list_connected is list_connected and driver("genicam").camera is genicam_camera
-    with pytest.raises(InputError, match=r"3 .*serial 0; .*serial 2"):
+    with raises(InputError, 3, "serial 0", "serial 1", "serial 2"):
         genicam_camera()
-    with pytest.raises(InputError, match="3 "):
+    with raises(InputError, 3, "serial 0", "serial 1", "serial 2"):
         genicam_camera(model="viky")
     with pytest.raises(DeviceError):
         genicam_camera(serial="23")
@@ -80,9 +88,9 @@ def test_cameras_are_found_and_chosen():
 def test_producers_that_are_missing_or_broken_are_named(monkeypatch, tmp_path):
     broken = tmp_path / "broken.cti"
     broken.write_text("no library")
-    with pytest.raises(InputError, match=r"\.cti"):
+    with raises(InputError, ".cti"):
         genicam_camera(producer=str(tmp_path / "none.cti"))
-    with pytest.raises(DeviceError, match=r"broken\.cti"):
+    with raises(DeviceError, "broken.cti"):
         genicam_camera(producer=str(broken))
     monkeypatch.setenv(PRODUCERS_VARIABLE, f"{tmp_path}:{VIKY.parent}:{tmp_path}")
     assert len(list_connected()) == 3
@@ -108,7 +116,7 @@ def test_a_hundred_frames_fill_the_array_they_are_given(camera):
 
 def test_frames_that_waited_are_not_returned(camera):
     first, began = column(grabbed(camera)), time.monotonic()
-    time.sleep(0.6)
+    fill_buffers(camera)
     second = column(grabbed(camera))
     periods = (time.monotonic() - began) / 0.05
     # a buffer that waited would be one of the three that came next
@@ -148,6 +156,7 @@ def test_mono_is_one_number_a_pixel():
         camera.close()
 
 
+@pytest.mark.computes
 def test_a_capture_of_a_sequence(camera):
     projector = preset_rig(scale=0.05).projector
     sequence = gray(projector.size)
@@ -161,14 +170,14 @@ def test_a_capture_of_a_sequence(camera):
 def test_what_the_camera_lacks_is_said(camera):
     assert camera.settings() == CameraSettings() == camera.apply(CameraSettings(5.0, 2.0))
     for options, lacks in (
-        ({"exposure_ms": 5.0}, "no exposure time"),
-        ({"gain": 2.0}, "no gain"),
-        ({"trigger": "software"}, "no software trigger"),
-        ({"trigger": "hardware", "line": "Line1"}, "no trigger lines"),
-        ({"pixel_format": "Mono12"}, "no Mono12 that can be read: use one of RGBa8, Mono8"),
-        ({"channel": "infrared"}, "no channel is called"),
+        ({"exposure_ms": 5.0}, ("exposure",)),
+        ({"gain": 2.0}, ("gain",)),
+        ({"trigger": "software"}, ("software trigger",)),
+        ({"trigger": "hardware", "line": "Line1"}, ("trigger lines",)),
+        ({"pixel_format": "Mono12"}, ("Mono12", "RGBa8", "Mono8")),
+        ({"channel": "infrared"}, ("infrared", "red", "green", "blue", "grey")),
     ):
-        with pytest.raises(InputError, match=lacks):
+        with raises(InputError, *lacks):
             genicam_camera(serial=1, **options)
 
 
@@ -207,9 +216,9 @@ def test_a_camera_that_sends_nothing_ends_this_grab_only(camera):
     fast(camera)._timeout_s = 0.2
     camera._link.node_map.AcquisitionStop.execute()
     began = time.monotonic()
-    with pytest.raises(DeviceError, match=r"0\.2 s"):
+    with raises(DeviceError, "0.2 s"):
         grabbed(camera)
-    assert 0.2 <= time.monotonic() - began < 10
+    assert 0.2 <= time.monotonic() - began < HANG_S
     column(grabbed(camera))
 
 
@@ -250,7 +259,7 @@ def test_a_camera_that_fails_to_open_is_given_back(camera):
     camera.close()
     camera.size = (300, 200)
     for _ in range(2):
-        with pytest.raises(DeviceError, match=r"400x400.*300x200"):
+        with raises(DeviceError, "400x400", "300x200"):
             camera.open()
     camera.size = (400, 400)
     camera.open()
@@ -270,24 +279,28 @@ def test_interrupts_and_other_threads_go_on_while_it_waits():
     before = signal.getsignal(signal.SIGINT)
     camera = genicam_camera(serial=0)
     camera.open()
-    ticks, done = [], threading.Event()
+    ticks, done = [0], threading.Event()
 
     def tick() -> None:
         while not done.wait(0.001):
-            ticks.append(time.monotonic())
+            ticks[0] += 1
+
+    def goes_on() -> bool:
+        """Whether the thread wakes often during three grabs: 9 times where the library waits by itself."""
+        before, began = ticks[0], time.monotonic()
+        for _ in range(3):
+            grabbed(camera)
+        assert time.monotonic() - began > 0.3
+        return ticks[0] - before > 60
 
     thread = threading.Thread(target=tick)
     thread.start()
-    began = time.monotonic()
     try:
-        for _ in range(3):
-            grabbed(camera)
+        assert until(goes_on)  # on a busy machine it wakes less often, though not always
     finally:
         done.set()
         thread.join()
         camera.close()
-    assert time.monotonic() - began > 0.3
-    assert len(ticks) > 60  # 9 where the library waits by itself
     assert signal.getsignal(signal.SIGINT) is before
 
 
@@ -297,9 +310,9 @@ def test_a_software_trigger_takes_the_next_frame(camera, monkeypatch):
     monkeypatch.setattr(camera, "_trigger", "software")
     monkeypatch.setattr(Features, "fire", lambda self: fired.append(time.monotonic()))
     first = column(grabbed(camera))
-    time.sleep(0.5)
+    fill_buffers(camera)
     second = column(grabbed(camera))
-    assert len(fired) == 2 and second - first >= 9
+    assert len(fired) == 2 and second - first > camera._link._acquirer.num_buffers
 
 
 def test_frames_of_another_shape_are_refused(camera):

@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 from types import SimpleNamespace
 
 import pytest
+from facts import raises
 
 from slviewer.devices.genicam_features import Features
 from slviewer.devices.pixel_formats import pixel_format
@@ -125,9 +126,9 @@ def test_a_line_triggers_where_it_is_named():
     camera.prepare(camera.choose_format("Mono8"), camera.choose_trigger("hardware", "Line3"), "Line3")
     assert nodes.TriggerSource.value == "Line3" and nodes.TriggerMode.modes["FrameStart"] == "On"
     for line in (None, "Line7", "Software"):
-        with pytest.raises(InputError, match="Line0, Line3"):
+        with raises(InputError, "Line0", "Line3"):
             camera.choose_trigger("hardware", line)
-    with pytest.raises(InputError, match="software, hardware, free"):
+    with raises(InputError, "often", "software", "hardware", "free"):
         camera.choose_trigger("often", None)
     assert camera.choose_trigger("free", None) == "free"
 
@@ -136,10 +137,10 @@ def test_a_camera_without_triggers_runs_free_and_says_so():
     nodes = machine_vision_camera()
     del nodes.TriggerSoftware
     assert features(nodes).choose_trigger(None, None) == "free"
-    with pytest.raises(InputError, match="software"):
+    with raises(InputError, "software"):
         features(nodes).choose_trigger("software", None)
     del nodes.TriggerMode
-    with pytest.raises(InputError, match="lines"):
+    with raises(InputError, "lines"):
         features(nodes).choose_trigger("hardware", "Line0")
 
 
@@ -193,9 +194,9 @@ def test_a_gain_in_steps_of_its_own_is_unknown():
         camera.check_settings(CameraSettings(gain=4.0))
     del nodes.Gain, nodes.ExposureTime
     assert camera.settings() == CameraSettings()
-    with pytest.raises(InputError, match="gain"):
+    with raises(InputError, "gain"):
         camera.check_settings(CameraSettings(gain=4.0))
-    with pytest.raises(InputError, match="exposure"):
+    with raises(InputError, "exposure"):
         camera.check_settings(CameraSettings(4.0))
 
 
@@ -209,13 +210,13 @@ def test_an_exposure_that_is_read_only_is_told_and_stays():
 def test_formats_that_it_has_not_are_refused():
     camera = features(nodes := machine_vision_camera())
     for name in ("Mono10", "BayerRG8", "rubbish"):
-        with pytest.raises(InputError, match=r"Mono8, Mono12, Mono12p.*pixel_format"):
+        with raises(InputError, "Mono8", "Mono12", "Mono12p", "pixel_format"):
             camera.choose_format(name)
     assert camera.choose_format("Mono12p").packing == "p"
     nodes.PixelFormat.offered = ("YUV422_8",)
     with pytest.raises(InputError):
         camera.choose_format()
-    with pytest.raises(DeviceError, match="pixel format"):
+    with raises(DeviceError, "pixel format"):
         camera.prepare(pixel_format("Mono12"), "free", None)
 
 

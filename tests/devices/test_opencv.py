@@ -11,6 +11,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from clocks import HANG_S, until
+from facts import missing_facts, raises
 from mjpeg import NetworkCamera, network_camera
 
 from slviewer.devices.capture import capture_with_texture
@@ -25,6 +27,12 @@ from slviewer.fringe.sequence import PatternSequence
 
 SIZE = (160, 120)
 FPS = 30.0
+
+
+def wait_pictures(seen: NetworkCamera, count: int) -> None:
+    """Wait until a network camera has sent so many pictures more."""
+    goal = seen.sent + count
+    assert until(lambda: seen.sent >= goal)
 
 
 def coded(number: int) -> np.ndarray:
@@ -72,7 +80,7 @@ def test_a_video_gives_frame_after_frame_and_says_when_it_ends(tmp_path):
         with opened(camera):
             assert [number(grabbed(camera)) for _ in range(6)] == list(range(6))
             assert camera.settings() == camera.apply(CameraSettings(5.0)) == CameraSettings()
-            with pytest.raises(DeviceError, match=r"film\.avi.* 6 "):
+            with raises(DeviceError, "film.avi", 6):
                 grabbed(camera)
     camera.close()
     with pytest.raises(DeviceError):
@@ -100,22 +108,22 @@ def test_each_channel_of_a_colour_video(tmp_path):
 
 def test_no_grab_returns_an_older_picture():
     rng = np.random.default_rng(1)
-    waits = []
+    passed = []  # pictures that were sent during a grab
     with network_camera(coded(0), FPS) as seen, opened(OpenCVCamera(seen.url, SIZE)) as camera:
         for k in range(1, 13):
-            time.sleep(0.8 if k == 8 else rng.uniform(0, 0.08))  # a second in which nobody asks
+            wait_pictures(seen, 24 if k == 8 else int(rng.integers(3)))  # for a while nobody asks
             seen.picture = coded(k)
-            asked = time.monotonic()
+            asked = seen.sent
             assert number(grabbed(camera)) == k
-            waits.append(time.monotonic() - asked)
-    assert 2 / FPS * 0.8 < np.median(waits) < 8 / FPS  # two whole frame periods at least, and little more
+            passed.append(seen.sent - asked)
+    assert 2 <= np.median(passed) < 8  # two whole frame periods at least, and little more
 
 
 def test_pictures_that_come_in_clumps_are_never_taken_for_new_ones():
     rng = np.random.default_rng(2)
     with network_camera(coded(0), FPS, clump=3) as seen, opened(OpenCVCamera(seen.url, SIZE)) as camera:
         for k in range(1, 6):
-            time.sleep(rng.uniform(0, 0.1))
+            wait_pictures(seen, int(rng.integers(4)))
             seen.picture = coded(k)
             assert number(grabbed(camera)) == k
 
@@ -153,22 +161,22 @@ def test_every_frame_of_a_capture_is_of_its_pattern():
 def test_a_stream_says_that_its_settings_are_its_own():
     with network_camera(coded(1)) as seen, opened(OpenCVCamera(seen.url, SIZE, exposure_ms=5.0)) as camera:
         (note,) = camera.notes
-        assert "secret" not in note + camera.name and camera.name == "the stream 127.0.0.1/video"
-        assert "exposure" in note
+        assert "secret" not in note + camera.name and not missing_facts(camera.name, "127.0.0.1/video")
+        assert not missing_facts(note, "exposure")
 
 
 def test_a_stream_that_stalls_is_told_and_comes_back():
     with network_camera(coded(1), FPS) as seen, opened(OpenCVCamera(seen.url, SIZE)) as camera:
         seen.going.clear()
         asked = time.monotonic()
-        with pytest.raises(DeviceError, match=r"127\.0\.0\.1/video"):
+        with raises(DeviceError, "127.0.0.1/video"):
             grabbed(camera)
-        assert 1.0 < time.monotonic() - asked < 15
+        assert 1.0 < time.monotonic() - asked < HANG_S
         asked = time.monotonic()
         with pytest.raises(DeviceError):
             camera.settings() and grabbed(camera)
         camera.close()
-        assert time.monotonic() - asked < 15
+        assert time.monotonic() - asked < HANG_S
         seen.going.set()
         seen.picture = coded(7)
         camera.open()
@@ -183,7 +191,7 @@ def test_a_camera_that_is_gone_is_told_and_works_once_it_is_back():
     asked = time.monotonic()
     with pytest.raises(DeviceError):
         grabbed(camera)
-    assert time.monotonic() - asked < 15
+    assert time.monotonic() - asked < HANG_S
     camera.close()
     with pytest.raises(DeviceError):
         camera.open()
@@ -194,8 +202,7 @@ def test_a_camera_that_is_gone_is_told_and_works_once_it_is_back():
 
 
 def test_another_size_is_told():
-    words = "160 x 120 px instead of 320 x 240: choose 160 x 120"
-    with network_camera(coded(1)) as seen, pytest.raises(DeviceError, match=words):
+    with network_camera(coded(1)) as seen, raises(DeviceError, "160 x 120", "320 x 240"):
         OpenCVCamera(seen.url, (320, 240)).open()
 
 
@@ -208,25 +215,26 @@ def test_what_does_not_answer_is_told_within_seconds_and_in_one_sentence(tmp_pat
     with socket.socket() as mute:  # it accepts, and says nothing
         mute.bind(("127.0.0.1", 0))
         mute.listen()
-        for source, words in (
-            (63, "the camera 63 does not answer: check its cable"),
-            ("/dev/video63", "the camera /dev/video63 does not answer"),
-            (str(tmp_path / "none.avi"), "none.avi does not exist"),
-            (str(text), "notes.avi cannot be read as a video"),
-            ("http://127.0.0.1:9/video", "the stream 127.0.0.1/video does not answer"),
-            ("rtsp://127.0.0.1:9/", "the stream 127.0.0.1 does not answer"),
-            (f"http://127.0.0.1:{mute.getsockname()[1]}/", "the stream 127.0.0.1 does not answer"),
+        for source, facts in (
+            (63, ("camera 63", "answer", "cable")),
+            ("/dev/video63", ("camera /dev/video63", "answer")),
+            (str(tmp_path / "none.avi"), ("none.avi", "exist")),
+            (str(text), ("notes.avi", "MJPEG")),
+            ("http://127.0.0.1:9/video", ("stream 127.0.0.1/video", "answer")),
+            ("rtsp://127.0.0.1:9/", ("stream 127.0.0.1", "answer")),
+            (f"http://127.0.0.1:{mute.getsockname()[1]}/", ("stream 127.0.0.1", "answer")),
         ):
             begun = time.monotonic()
-            with pytest.raises(DeviceError, match=words):
+            with raises(DeviceError, *facts):
                 OpenCVCamera(source)
-            assert time.monotonic() - begun < 15, source
+            assert time.monotonic() - begun < HANG_S, source
     camera = OpenCVCamera("63", SIZE)  # with its size given, it may be plugged in later
-    with pytest.raises(DeviceError, match="camera 63"):
+    with raises(DeviceError, "camera 63"):
         camera.open()
     camera.close()
 
 
+@pytest.mark.process
 def test_the_libraries_keep_quiet(tmp_path):
     script = (
         "from slviewer.devices.opencv import OpenCVCamera\n"
@@ -235,7 +243,7 @@ def test_the_libraries_keep_quiet(tmp_path):
         "    try: OpenCVCamera(source)\n"
         "    except DeviceError as error: print(error)\n"
     )
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=30, check=True)
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=300, check=True)
     assert done.stdout.count("\n") == 3 and done.stderr == ""
 
 
@@ -302,10 +310,3 @@ def test_a_camera_in_use_is_chosen_once_more_and_taken_over():
     finally:
         if not server.dead:
             server.die()
-
-
-def until(condition, timeout_s: float = 30.0) -> bool:
-    end = time.monotonic() + timeout_s
-    while not condition() and time.monotonic() < end:
-        time.sleep(0.01)
-    return bool(condition())

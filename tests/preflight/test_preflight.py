@@ -1,11 +1,15 @@
 """What is wrong with a rig is named, and a sound rig is left in peace."""
 
-import time
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from time import process_time
+from typing import Any
 
 import numpy as np
 import pytest
+from clocks import SteppingClock
+from facts import missing_facts
 from imperfect_rig import Imperfections, imperfect, resampled_rig
 
 from slviewer.devices.protocols import CameraSettings, Rig
@@ -15,42 +19,64 @@ from slviewer.errors import Cancelled
 from slviewer.pipeline.check_results import Preflight
 from slviewer.pipeline.rig_choice import set_up
 from slviewer.preflight.check_rig import check_rig, preflight
+from slviewer.preflight.turntable import check_turntable
 from slviewer.simulation.boards import Pose
 from slviewer.simulation.rig import letter
 
 pytestmark = pytest.mark.computes
 
-SCALE = 0.2
+SCALE = 0.1
 
 
 def world(**how) -> SimulatedWorld:
     return SimulatedWorld(letter(SCALE, **how))
 
 
-def looked(rig: Rig, exposure_ms: float | None = None, **how) -> Preflight:
-    with rig.opened():
-        if exposure_ms is not None:
-            rig.camera.apply(CameraSettings(exposure_ms))
-        return preflight(rig, **how)
+@pytest.fixture
+def time() -> SteppingClock:
+    return SteppingClock(step_s=0.001)
+
+
+Looked = Callable[..., Preflight]
+Lying = Callable[..., Rig]
+
+
+@pytest.fixture
+def looked(time: SteppingClock) -> Looked:
+    """Checks a rig."""
+
+    def check(rig: Rig, **how: Any) -> Preflight:
+        with rig.opened():
+            return preflight(rig, clock=time.clock, **how)
+
+    return check
 
 
 def wrong_with(found: Preflight) -> set[str]:
     return {check.name for check in found.checks if check.verdict in ("bad", "warning")}
 
 
-def lying(**wrong) -> Rig:
-    return imperfect(simulated_rig(world()), Imperfections(**wrong))[0]
+@pytest.fixture
+def lying(time: SteppingClock) -> Lying:
+    """Makes a simulated rig with imperfections."""
+    return lambda **wrong: imperfect(simulated_rig(world()), Imperfections(**wrong), time.clock)[0]
+
+
+@pytest.fixture
+def compiled(looked: Looked) -> None:
+    """The kernels that a check uses are compiled."""
+    looked(simulated_rig(world()))
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_sound_rig_is_left_in_peace(seed):
+def test_a_sound_rig_is_left_in_peace(seed, looked, compiled):
     said: list[str] = []
     done: list[float] = []
-    before = time.process_time()
+    before = process_time()
     found = looked(simulated_rig(world(seed=seed)), say=said.append, progress=lambda share, doing: done.append(share))
     assert wrong_with(found) == set() and found.verdict == "good"
     assert found.settle_ms == 0 and found.exposure_ms is None
-    assert found.seconds > 0 and time.process_time() - before < 10  # of the processor, whatever else it does
+    assert found.seconds > 0 and process_time() - before < 10  # of the processor, whatever else it does
     assert len(said) == len(found.checks) == 10 and done == sorted(done) and done[-1] == 1.0
     assert all(check.sentence.endswith(".") for check in found.checks)
     assert found.to_dict()["checks"][0]["name"] == "screen"
@@ -58,18 +84,18 @@ def test_a_sound_rig_is_left_in_peace(seed):
     assert np.abs(table - np.arange(256)).max() <= 2
 
 
-def test_a_turntable_is_checked_too():
+def test_a_turntable_is_checked_too(looked):
     scene = world()
     found = looked(replace(simulated_rig(scene), turntable=SimulatedTurntable(scene)))
     assert found.check("turntable").verdict == found.verdict == "good" and len(found.checks) == 11
     assert abs(scene.table_deg) < 0.2 and scene.standing == "board"
     lame = SimulatedTurntable(scene)
     lame.open()
-    broken = looked(replace(simulated_rig(scene), turntable=lame))
-    assert wrong_with(broken) == {"turntable"} and "close it first" in broken.check("turntable").remedy.lower()
+    broken = check_turntable(lame)
+    assert broken.verdict == "bad" and not missing_facts(broken.remedy, "close")
 
 
-def test_gamma_is_measured_and_mended_by_its_table():
+def test_gamma_is_measured_and_mended_by_its_table(looked):
     found = looked(simulated_rig(world(gamma=2.2)))
     assert wrong_with(found) == {"gamma"}
     figures = found.check("gamma").figures
@@ -81,12 +107,9 @@ def test_gamma_is_measured_and_mended_by_its_table():
     assert found.check("pixels").verdict == "good"
 
 
-def test_latency_is_measured_and_waited_for():
-    for _ in range(4):  # on a busy machine the wait is longer, and is measured so
-        found = looked(lying(latency_ms=25, frame_ms=6))
-        figures = found.check("latency").figures
-        if figures["latency_ms"] <= 70:
-            break
+def test_latency_is_measured_and_waited_for(looked, lying):
+    found = looked(lying(latency_ms=25, frame_ms=6))
+    figures = found.check("latency").figures
     assert wrong_with(found) == set()
     assert 18 <= figures["latency_ms"] <= 70 and figures["latency_frames"] > 1
     assert 25 <= found.settle_ms <= 100
@@ -94,7 +117,7 @@ def test_latency_is_measured_and_waited_for():
 
 
 @pytest.mark.parametrize("images", [1, 2])
-def test_a_camera_that_is_behind_is_named(images):
+def test_a_camera_that_is_behind_is_named(images, looked, lying):
     found = looked(lying(lag=images))
     assert wrong_with(found) == {"latency", "order"}
     assert found.check("latency").figures["stale_images"] == images
@@ -102,36 +125,36 @@ def test_a_camera_that_is_behind_is_named(images):
 
 
 @pytest.mark.parametrize(
-    ("wrong", "names", "said"),
+    ("wrong", "names", "facts"),
     [
-        ({"late": {9}}, {"order"}, "frame 10 shows the pattern of frame 9"),
-        ({"late": {3}}, {"order"}, "frame 4 shows the wrong level"),
-        ({"repeated": {9}}, {"order", "repeats"}, "frame 10 shows the pattern of frame 9"),
-        ({"dropped": 10}, {"order"}, "frame 11 is missing"),
-        ({"swapped": 8}, {"order"}, "frames 9 and 10 have changed places"),
+        ({"late": {9}}, {"order"}, ("frame 10", "frame 9")),
+        ({"late": {3}}, {"order"}, ("frame 4", "level")),
+        ({"repeated": {9}}, {"order", "repeats"}, ("frame 10", "frame 9")),
+        ({"dropped": 10}, {"order"}, ("frame 11", "missing")),
+        ({"swapped": 8}, {"order"}, ("frames 9 and 10", "places")),
     ],
 )
-def test_frames_out_of_order_are_named(wrong, names, said):
+def test_frames_out_of_order_are_named(wrong, names, facts, looked, lying):
     found = looked(lying(**wrong))
     assert wrong_with(found) == names and found.verdict == "bad"
-    assert said in found.check("order").sentence
+    assert not missing_facts(found.check("order").sentence, *facts)
 
 
-def test_another_screen_is_named():
+def test_another_screen_is_named(looked, lying):
     found = looked(lying(elsewhere=True))
     assert wrong_with(found) == {"screen"} and found.verdict == "bad"
     assert found.settle_ms is None and found.levels is None
-    assert "right screen" in found.check("screen").remedy
+    assert not missing_facts(found.check("screen").remedy, "screen")
     assert found.check("gamma").verdict == "unknown"
 
 
 @pytest.mark.parametrize(("exposure_ms", "verdict"), [(2.0, "bad"), (0.3, "warning"), (0.08, "bad")])
-def test_a_wrong_exposure_is_named_with_a_better_one(exposure_ms, verdict):
+def test_a_wrong_exposure_is_named_with_a_better_one(exposure_ms, verdict, time):
     rig = simulated_rig(world())
     with rig.opened():
         for _ in range(3):  # how much too bright cannot be seen at once
             rig.camera.apply(CameraSettings(exposure_ms))
-            found = preflight(rig)
+            found = preflight(rig, clock=time.clock)
             assert found.check("exposure").verdict == verdict
             if found.exposure_ms is None or verdict != "bad" or exposure_ms < 1:
                 break
@@ -143,30 +166,30 @@ def test_a_wrong_exposure_is_named_with_a_better_one(exposure_ms, verdict):
 
 
 @pytest.mark.parametrize(("hertz", "exposure"), [(100.0, "10 ms"), (120.0, "8.33 ms")])
-def test_mains_light_is_named_with_its_frequency(hertz, exposure):
+def test_mains_light_is_named_with_its_frequency(hertz, exposure, looked, lying):
     found = looked(lying(room=25, mains_depth=0.4, mains_hz=hertz))
     flicker = found.check("flicker")
-    assert flicker.verdict == "bad" and "room's" in flicker.sentence
-    assert exposure in flicker.remedy
+    assert flicker.verdict == "bad" and not missing_facts(flicker.sentence, "room's")
+    assert not missing_facts(flicker.remedy, exposure)
     assert flicker.figures["mains_hz"] in (None, int(hertz))
     assert wrong_with(found) <= {"flicker", "exposure", "ambient"}
     assert wrong_with(looked(lying(lamp_depth=0.06))) == {"flicker"}
 
 
-def test_a_bright_room_is_named():
+def test_a_bright_room_is_named(looked):
     dim = letter(SCALE)
     dim = replace(dim, light=replace(dim.light, ambient=0.6))
     assert wrong_with(looked(simulated_rig(SimulatedWorld(dim)))) == {"ambient"}
 
 
-def test_a_lamp_switched_on_meanwhile_is_named():
-    rig, wrong = imperfect(simulated_rig(world()))
+def test_a_lamp_switched_on_meanwhile_is_named(looked, time):
+    rig, wrong = imperfect(simulated_rig(world()), clock=time.clock)
 
     def switch(sentence: str) -> None:
         wrong.room = 12.0
 
     found = looked(rig, say=switch)
-    assert "ambient" in wrong_with(found) and "brighter by" in found.check("ambient").sentence
+    assert "ambient" in wrong_with(found) and not missing_facts(found.check("ambient").sentence, "brighter")
     assert "motion" not in wrong_with(found)
 
 
@@ -183,7 +206,7 @@ def test_the_camera_is_left_as_it_was():
     assert camera.settings() == CameraSettings(1.0, 1.0)
 
 
-def test_what_moves_is_named():
+def test_what_moves_is_named(looked):
     here = world()
 
     def push(sentence: str) -> None:
@@ -195,13 +218,14 @@ def test_what_moves_is_named():
     assert wrong_with(found) == {"motion"}
 
 
-def test_patterns_that_are_scaled_are_named():
+def test_patterns_that_are_scaled_are_named(looked):
     found = looked(resampled_rig(world(gamma=2.2), 1.1))
-    assert found.check("pixels").verdict == "bad" and "native resolution" in found.check("pixels").remedy
+    assert found.check("pixels").verdict == "bad"
+    assert not missing_facts(found.check("pixels").remedy, "native resolution")
     assert wrong_with(found) == {"gamma", "pixels"}
 
 
-def test_it_stops_when_it_is_told_to():
+def test_it_stops_when_it_is_told_to(looked):
     def stop(share: float, doing: str) -> None:
         if share > 0.3:
             raise Cancelled("cancelled")
@@ -229,7 +253,7 @@ class TwelveBits:
         out[:] = eight.astype(np.uint16) * 16 + 7
 
 
-def test_a_camera_of_twelve_bits_that_says_nothing_of_its_exposure():
+def test_a_camera_of_twelve_bits_that_says_nothing_of_its_exposure(looked):
     rig = simulated_rig(world())
     found = looked(Rig("twelve", TwelveBits(rig.camera), rig.projector))
     assert wrong_with(found) == set() and found.exposure_ms is None

@@ -5,13 +5,12 @@ import http.client
 import json
 import socket
 import threading
-import time
-from collections.abc import Callable
 from typing import Any
 
 import msgspec
 import viser
 import zstandard
+from clocks import HANG_S, until
 from websockets.sync.client import ClientConnection, connect
 
 from slviewer.server.access import Role
@@ -30,15 +29,6 @@ CAMERA = {
 }
 
 
-def until(condition: Callable[[], Any], seconds: float = 30.0) -> bool:
-    end = time.monotonic() + seconds
-    while not condition():
-        if time.monotonic() > end:
-            return False
-        time.sleep(0.005)
-    return True
-
-
 class Client:
     """A WebSocket to viser, past the authentication."""
 
@@ -46,6 +36,7 @@ class Client:
         self.server = server
         self.socket = connection
         self.received: list[dict] = []
+        self._moves = 10
         self.thread = threading.Thread(target=self._listen, daemon=True)
         self.thread.start()
         before = set(server.viser.get_clients())
@@ -67,6 +58,13 @@ class Client:
     def set(self, handle: Any, value: Any) -> None:
         self.send("GuiUpdateMessage", uuid=handle._impl.uuid, updates={"value": value})
 
+    def flush(self) -> None:
+        """Wait until all that was sent before has been handled, whatever the role."""
+        self._moves += 1
+        self.send("ViewerCameraMessage", **{**CAMERA, "position": [self._moves, 0, 0]})
+        camera = self.server.viser.get_clients()[self.number].camera
+        assert until(lambda: camera.position.tolist() == [self._moves, 0, 0])
+
     def told(self, handle: Any) -> list:
         """The values of an input that the server sent since the client connected."""
         updates = [m for m in self.received if m["type"] == "GuiUpdateMessage" and m["uuid"] == handle._impl.uuid]
@@ -86,7 +84,7 @@ class Browser:
 
     def get(self, path: str = "", **headers: str) -> http.client.HTTPResponse:
         """The answer, with its body in `.content`; a path without a slash is below the role's."""
-        connection = http.client.HTTPConnection("127.0.0.1", self.server.port, timeout=5)
+        connection = http.client.HTTPConnection("127.0.0.1", self.server.port, timeout=HANG_S)
         cookie = {"Cookie": self.cookie} if self.cookie else {}
         named = {name.replace("_", "-"): value for name, value in headers.items()}
         address = path if path.startswith(("/", "http")) else self.path + path
@@ -116,7 +114,7 @@ class Browser:
         uri = f"ws://{host or self.host}{path if path.startswith('/') else self.path + path}"
         return connect(
             uri,
-            sock=socket.create_connection(("127.0.0.1", self.server.port), timeout=5),
+            sock=socket.create_connection(("127.0.0.1", self.server.port), timeout=HANG_S),
             additional_headers=headers,
             subprotocols=[f"viser-v{viser.__version__}"],
             max_size=2**26,
@@ -139,7 +137,7 @@ def settle(client: Client) -> None:
     mark = gui.add_checkbox("settled", False)
     mark.on_update(lambda _: seen.set())
     client.set(mark, True)
-    assert seen.wait(5)
+    assert seen.wait(HANG_S)
     mark.remove()
 
 

@@ -7,16 +7,19 @@ import html
 import os
 import re
 import socket
-import time
+import threading
+from collections.abc import Iterator
 
 import pytest
-from server_client import Browser, until
+from clocks import HANG_S, until
+from server_client import Browser
 from websockets.exceptions import InvalidStatus
 
 from slviewer.errors import InputError
-from slviewer.server import connection
 from slviewer.server.auth_middleware import DevicePage
 from slviewer.server.connection import CHUNK
+from slviewer.server.limits import CONNECTIONS
+from slviewer.server.secure import Serving, serve
 from slviewer.server.text import escape, safe_name
 
 PAGE = "<!doctype html><title>projector</title><script>let a = 1</script>"
@@ -81,35 +84,48 @@ def test_addresses_that_were_not_offered_are_nothing(operator, path):
     assert operator.get(path).status == 404
 
 
-def test_a_slow_reader_of_a_large_file_costs_little_and_stops_nobody(operator, tmp_path):
-    size = 512 * CHUNK
-    with (tmp_path / "large.bin").open("wb") as file:
-        file.truncate(size)
-    address = operator.server.downloads.offer(tmp_path / "large.bin", within=tmp_path)
-    with socket.create_connection(("127.0.0.1", operator.server.port)) as slow:
+LARGE = 512 * CHUNK
+"""Bytes of a file that the buffers of no connection take."""
+
+
+@pytest.fixture
+def serving(tmp_path) -> Iterator:
+    """Starts a server of a large file, and returns the operator's browser and the file's address."""
+    servers = []
+
+    def start(**options: object) -> tuple[Browser, str]:
+        with (tmp_path / "large.bin").open("wb") as file:
+            file.truncate(LARGE)
+        servers.append(serve(Serving(port=0), **options))
+        return Browser(servers[-1], "operate"), servers[-1].downloads.offer(tmp_path / "large.bin", within=tmp_path)
+
+    yield start
+    for server in servers:
+        server.stop()
+
+
+def test_a_slow_reader_of_a_large_file_costs_little_and_stops_nobody(serving):
+    operator, address = serving(stall_s=10 * HANG_S)  # whoever waited for the slow reader would wait for too long
+    with socket.create_connection(("127.0.0.1", operator.server.port), timeout=HANG_S) as slow:
         slow.sendall(operator.raw_request(address))
         assert slow.recv(100).startswith(b"HTTP/1.1 200")
-        start = time.monotonic()
         assert operator.get().status == 200
-        assert hashlib.md5(operator.get(address).content).digest() == hashlib.md5(bytes(size)).digest()
-        assert time.monotonic() - start < 20
+        content = operator.get(address).content
+        assert len(content) == content.count(0) == LARGE
     assert operator.get().status == 200  # the reader that left half-way did no harm
 
 
-def test_a_reader_who_takes_nothing_is_let_go(operator, tmp_path, monkeypatch):
-    monkeypatch.setattr(connection, "STALL_SECONDS", 0.2)
-    with (tmp_path / "large.bin").open("wb") as file:
-        file.truncate(512 * CHUNK)
-    address = operator.server.downloads.offer(tmp_path / "large.bin", within=tmp_path)
-    with socket.create_connection(("127.0.0.1", operator.server.port)) as stalled:
+def test_a_reader_who_takes_nothing_is_let_go(serving):
+    operator, address = serving(stall_s=0.2, connections={**CONNECTIONS, "operate": 1})
+    with socket.create_connection(("127.0.0.1", operator.server.port), timeout=HANG_S) as stalled:
         stalled.sendall(operator.raw_request(address))
-        time.sleep(0.6)
-        stalled.settimeout(2)
-        received = 0
+        assert stalled.recv(100).startswith(b"HTTP/1.1 200")
+        assert until(lambda: operator.get().status == 200), "its connection is free again"
+        received = 100
         with contextlib.suppress(ConnectionError):
             while part := stalled.recv(CHUNK):
                 received += len(part)
-        assert received < 512 * CHUNK
+        assert received < LARGE
 
 
 def test_the_projector_page_has_a_link_of_its_own(server, operator, watcher, projector_page, stranger):
@@ -124,7 +140,7 @@ def test_the_projector_page_has_a_link_of_its_own(server, operator, watcher, pro
     assert f"script-src 'sha256-{script}';" in answer.headers["Content-Security-Policy"]
     with projector_page.open() as socket_:
         socket_.send("hello")
-        assert socket_.recv(2) == "project: hello"
+        assert socket_.recv(HANG_S) == "project: hello"
     for origin in ("http://evil.example", None):
         with pytest.raises(InvalidStatus):
             projector_page.open(origin=origin)
@@ -203,22 +219,17 @@ def test_long_names_are_cut_and_keep_their_suffix():
     assert name.endswith(".ply") and len(name.encode()) <= 200 and len(safe_name("a." + "b" * 500)) <= 120
 
 
-def test_the_server_stops_and_its_port_is_free_again(tmp_path):
-    from slviewer.server.secure import Serving, serve
-
-    with (tmp_path / "large.bin").open("wb") as file:
-        file.truncate(512 * CHUNK)
-    server = serve(Serving(port=0))
-    browser = Browser(server, "operate")
-    client = browser.client()
-    address = server.downloads.offer(tmp_path / "large.bin", within=tmp_path)
-    with socket.create_connection(("127.0.0.1", server.port)) as slow:
+def test_the_server_stops_and_its_port_is_free_again(serving):
+    browser, address = serving(stall_s=10 * HANG_S)
+    server, client = browser.server, browser.client()
+    with socket.create_connection(("127.0.0.1", server.port), timeout=HANG_S) as slow:
         slow.sendall(browser.raw_request(address))
         slow.recv(100)
-        start = time.monotonic()
-        server.stop()
-        assert time.monotonic() - start < 20
-    client.thread.join(3)
+        stopping = threading.Thread(target=server.stop, daemon=True)
+        stopping.start()
+        stopping.join(HANG_S)
+        assert not stopping.is_alive()
+    client.thread.join(HANG_S)
     assert not client.thread.is_alive()
     again = serve(Serving(port=server.port))
     again.stop()

@@ -6,7 +6,8 @@ from functools import partial
 
 import msgspec
 import pytest
-from server_client import CAMERA, announced, settle, until
+from clocks import until
+from server_client import CAMERA, announced, settle
 
 from slviewer.errors import SlviewerError
 from slviewer.server import viser_internals
@@ -247,8 +248,12 @@ def test_no_client_opens_a_tunnel(server, operator, gui):
     with pytest.raises(SlviewerError):
         server.viser.request_share_url()
     gui.configure_theme(dark_mode=True)
-    assert until(lambda: [m for m in client.received if m["type"] == "ThemeConfigurationMessage"][-1]["dark_mode"])
-    assert not any(m["show_share_button"] for m in client.received if m["type"] == "ThemeConfigurationMessage")
+
+    def themes() -> list[dict]:
+        return [message for message in client.received if message["type"] == "ThemeConfigurationMessage"]
+
+    assert until(lambda: themes() and themes()[-1]["dark_mode"])
+    assert not any(theme["show_share_button"] for theme in themes())
 
 
 def test_messages_of_the_server_are_none_of_a_client(server, operator, gui):

@@ -4,14 +4,16 @@ import contextlib
 import logging
 import socket
 import threading
-import time
+from pathlib import Path
 
 import pytest
-from server_client import Browser, until
+from clocks import HANG_S, SteppingClock, until
+from server_client import Browser
 
 from slviewer.server import limits
 from slviewer.server.connection import REQUEST_BYTES
-from slviewer.server.limits import STRANGERS_PER_ADDRESS, Listener, OncePerSecond, address_group
+from slviewer.server.limits import CONNECTIONS, STRANGERS_PER_ADDRESS, Listener, OncePerSecond, address_group
+from slviewer.server.secure import Serving, serve
 
 
 @pytest.fixture
@@ -22,7 +24,7 @@ def crowd(server):
         def open_connections(count: int, said: bytes = b"") -> list[socket.socket]:
             opened = []
             for _ in range(count):
-                opened.append(ended.enter_context(socket.create_connection(("127.0.0.1", server.port), timeout=5)))
+                opened.append(ended.enter_context(socket.create_connection(("127.0.0.1", server.port), timeout=HANG_S)))
                 with contextlib.suppress(OSError):
                     opened[-1].sendall(said)
             return opened
@@ -61,19 +63,22 @@ def test_a_request_without_end_is_ended(server, crowd):
     assert until(lambda: not is_open(endless))
 
 
-def test_each_role_has_so_many_connections(server, operator, watcher, monkeypatch):
-    monkeypatch.setitem(limits.CONNECTIONS, "watch", 2)
-    first, second = watcher.client(), watcher.client()
-    assert watcher.get().status == 503 and operator.get().status == 200
-    first.socket.close()
-    assert until(lambda: watcher.get().status == 200)
-    second.socket.close()
+def test_each_role_has_so_many_connections():
+    server = serve(Serving(port=0), connections={**CONNECTIONS, "watch": 2})
+    try:
+        watcher, operator = Browser(server, "watch"), Browser(server, "operate")
+        first, second = watcher.client(), watcher.client()
+        assert watcher.get().status == 503 and operator.get().status == 200
+        first.socket.close()
+        assert until(lambda: watcher.get().status == 200)
+        second.socket.close()
+    finally:
+        server.stop()
 
 
 def test_the_busiest_address_makes_room(monkeypatch):
-    monkeypatch.setattr(limits, "STRANGERS", 4)
     closed = []
-    with Listener(socket.AF_INET, socket.SOCK_STREAM) as listener:
+    with Listener(socket.AF_INET, socket.SOCK_STREAM, strangers=4) as listener:
         for number, address in enumerate(["192.0.2.1", "192.0.2.1", "192.0.2.1", "192.0.2.2", "192.0.2.3"]):
             one = limits._Accepted(socket.AF_INET, socket.SOCK_STREAM)
             monkeypatch.setattr(one, "shutdown", lambda how, number=number: closed.append(number), raising=False)
@@ -102,7 +107,8 @@ def test_addresses_of_one_subscriber_are_one():
 
 
 def test_a_fault_is_logged_once_a_second():
-    records = OncePerSecond()
+    clock = SteppingClock()
+    records = OncePerSecond(clock.now)
 
     def passes(text: str, error: type[Exception] | None = None) -> bool:
         info = (error, error(), None) if error else None
@@ -110,13 +116,13 @@ def test_a_fault_is_logged_once_a_second():
 
     assert [passes("failed %s") for _ in range(50)] == [True] + [False] * 49
     assert passes("another") and passes("failed %s", OSError) and not passes("failed %s", OSError)
+    clock.sleep(1.01)
+    assert passes("failed %s") and not passes("failed %s")
     for name in ("slviewer.server", "slviewer.server.websockets", "asyncio"):
         assert any(isinstance(one, OncePerSecond) for one in logging.getLogger(name).filters)
 
 
 def test_descriptors_are_given_back(server, operator):
-    from pathlib import Path
-
     open_files = Path("/proc/self/fd")
     if not open_files.exists():
         pytest.skip("the system does not list open files")
@@ -124,7 +130,7 @@ def test_descriptors_are_given_back(server, operator):
 
     def knock() -> None:
         for _ in range(100):
-            with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", server.port), timeout=5):
+            with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", server.port), timeout=HANG_S):
                 pass
 
     threads = [threading.Thread(target=knock) for _ in range(4)]
@@ -133,5 +139,4 @@ def test_descriptors_are_given_back(server, operator):
     for thread in threads:
         thread.join()
     assert until(lambda: len(list(open_files.iterdir())) <= before + 4)
-    time.sleep(0.1)
     assert operator.get().status == 200

@@ -1,7 +1,8 @@
 """Uploads: within the limit, under a harmless name, by whoever announced them."""
 
 import pytest
-from server_client import Browser, announced, part, settle, until
+from clocks import until
+from server_client import Browser, announced, part, settle
 
 
 @pytest.fixture

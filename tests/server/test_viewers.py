@@ -1,12 +1,13 @@
 """Who has drawn what: one that answers is ready again, one that stalls is asked nothing more and holds nobody up."""
 
 import threading
-import time
 
-from server_client import Browser, Client, until
+import pytest
+from clocks import HANG_S, SteppingClock, until
+from server_client import Browser, Client
 
 from slviewer.server.secure import SafeServer
-from slviewer.server.viewers import Viewers
+from slviewer.server.viewers import STALLED_S, Viewers
 
 
 def answer(client: Client) -> None:
@@ -24,7 +25,8 @@ def test_each_is_ready_once_it_has_drawn_what_it_was_sent(
 ) -> None:
     quick, slow = operator.client(), watcher.client()
     heard = threading.Event()
-    viewers = Viewers(server.viser, heard.set)
+    clock = SteppingClock()
+    viewers = Viewers(server.viser, heard.set, clock.now)
 
     def ready() -> set[int]:
         return {client.client_id for client in viewers.ready()} & {quick.number, slow.number}
@@ -36,13 +38,18 @@ def test_each_is_ready_once_it_has_drawn_what_it_was_sent(
     assert ready() == set()
     assert until(lambda: asked(quick) == asked(slow) == 1)
     assert quick.received[-2]["type"] == "LabelMessage" or "Label" in str(quick.received[:-1])  # drawn before it asks
-    time.sleep(0.05)
+    clock.sleep(0.25)
     answer(quick)
-    assert until(lambda: ready() == {quick.number}) and heard.wait(1)
-    assert 0.05 < viewers.slowest_s() < 1
+    assert until(lambda: ready() == {quick.number}) and heard.wait(HANG_S)
+    assert viewers.slowest_s() == pytest.approx(0.25)
+    clock.sleep(0.5)
+    assert viewers.slowest_s() == pytest.approx(0.75), "the slow one has not answered yet"
+    clock.sleep(STALLED_S)
+    assert viewers.slowest_s() == pytest.approx(0.25), "one that stalls sets the pace for itself alone"
     answer(quick)  # an answer to nothing is let in by nobody
     slow.send("LocalStorageGetItemResponseMessage", value=None, error=None, request_uuid="another")
-    time.sleep(0.05)
+    quick.flush()
+    slow.flush()
     assert ready() == {quick.number}
     answer(slow)  # who only watches may say so too
     assert until(lambda: ready() == {quick.number, slow.number})
