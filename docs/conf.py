@@ -1,8 +1,8 @@
 """Sphinx configuration of the site: ``python -m sphinx -W -b html docs docs/_build``.
 
 Sphinx, as NumPy, Open3D, napari and scikit-image use it: it reads the docstrings. The command line's reference is
-written by the build, from the commands themselves. Neither building nor reading needs a network. Links between pages
-are checked by a test.
+written by the build, from the commands themselves. Neither building nor reading needs a network: a page that loads
+something from one is a warning. Links between pages are checked by a test.
 """
 
 import ast
@@ -20,6 +20,7 @@ from typing import Any
 
 from docutils import nodes
 from sphinx.application import Sphinx
+from sphinx.util import logging
 
 DOCS = Path(__file__).parent
 sys.path.insert(0, str(DOCS.parent))
@@ -41,6 +42,12 @@ autodoc_member_order = "bysource"
 myst_heading_anchors = 3
 myst_fence_as_directive = ["math"]  # as GitHub and the program's own help read it
 html_math_renderer = "svg"
+MIN_PAGES = 16
+"""Fewer mean that a folder of pages is missing."""
+LOADED = re.compile(
+    r"""<(?:script|img|iframe|source)\b[^>]*?\bsrc=["']?(?:https?:)?//[^>]*|<link\b[^>]*?href=["']?https?:[^>]*"""
+)
+"""What a page loads from a network."""
 default_role = "code"  # names in docstrings stand in single backticks
 html_theme = "pydata_sphinx_theme"
 html_title = "slviewer"
@@ -179,7 +186,21 @@ def write_equation(writer: Any, node: nodes.math_block) -> None:
     raise nodes.SkipNode
 
 
+def check_pages(app: Sphinx, exception: Exception | None) -> None:
+    """Warn where the finished site has too few pages, or a page loads something from a network."""
+    if exception is not None or app.builder.format != "html":
+        return
+    warn = logging.getLogger(__name__).warning
+    pages = sorted(Path(app.outdir).rglob("*.html"))
+    if len(pages) < MIN_PAGES:
+        warn(f"the site has {len(pages)} pages, at least {MIN_PAGES} are expected")
+    for page in pages:
+        if loaded := LOADED.search(page.read_text(encoding="utf-8")):
+            warn(f"{page.relative_to(app.outdir)} loads something from a network: {loaded[0]}")
+
+
 def setup(app: Sphinx) -> None:
-    """Write the pages that are made from the program before all are read."""
+    """Write the pages that are made from the program before all are read, and check the finished site."""
     app.connect("builder-inited", write_references)
+    app.connect("build-finished", check_pages)
     app.add_html_math_renderer("svg", (write_equation, None), (write_equation, None))

@@ -15,6 +15,8 @@ docs/images/gallery, and those of docs/diagrams.py into docs/images/diagrams.
 """
 
 import argparse
+import contextlib
+import io
 import json
 import os
 import re
@@ -28,6 +30,10 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+from slviewer import cli  # noqa: E402
+
 EXAMPLES = ROOT / "docs" / "examples"
 GALLERY = ROOT / "docs" / "images" / "gallery"
 BLOCK = re.compile(
@@ -170,18 +176,12 @@ def run(command: str) -> str:
     name, *arguments = shlex.split(command)
     if name != "slviewer":
         raise SystemExit(f"{command}: figures come from commands of slviewer")
-    with tempfile.TemporaryDirectory() as folder:
-        done = subprocess.run(
-            [sys.executable, "-m", "slviewer.cli", *arguments],
-            cwd=folder,
-            env=os.environ | {"PYTHONPATH": str(ROOT), "NO_COLOR": "1"},
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-    if done.returncode:
-        raise SystemExit(f"{command} failed: {done.stderr}")
-    return f"\n```text\n{done.stdout.rstrip()}\n```\n\n"
+    printed = io.StringIO()
+    with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder), contextlib.redirect_stdout(printed):
+        status = cli.main(arguments)
+    if status:
+        raise SystemExit(f"{command} failed with status {status}")
+    return f"\n```text\n{printed.getvalue().rstrip()}\n```\n\n"
 
 
 def agree(written: str, printed: str) -> bool:

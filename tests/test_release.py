@@ -54,7 +54,8 @@ def test_the_version_without_git_is_the_same_in_the_build_and_in_the_package() -
     assert re.fullmatch(r"\d+\.\d+\.\d+[\w.+]*", slviewer.__version__)
 
 
-@pytest.mark.computes
+@pytest.mark.slow
+@pytest.mark.process
 def test_an_sdist_holds_sources_docs_tests_and_assets_and_no_caches(built) -> None:
     with tarfile.open(built[0]) as archive:
         names = {name.partition("/")[2] for name in archive.getnames()}
@@ -63,7 +64,8 @@ def test_an_sdist_holds_sources_docs_tests_and_assets_and_no_caches(built) -> No
     assert not [name for name in names if re.search(r"__pycache__|\.venv|\.git/|\.\w+_cache/|^dist/|\.zarr", name)]
 
 
-@pytest.mark.computes
+@pytest.mark.slow
+@pytest.mark.process
 def test_a_wheel_works_without_the_checkout(built, tmp_path) -> None:
     with zipfile.ZipFile(built[1]) as archive:
         names = set(archive.namelist())

@@ -55,6 +55,7 @@ RANGES: dict[str, tuple[float, float]] = {
     "seed": (0, (1 << 32) - 1),
     "smooth": (0, 1000),
     "triangles": (1, 1e9),
+    "wait_s": (1, LARGEST),
 }
 """Of the numbers that a command takes, by its parameter, where they are narrower."""
 JSON = Option("json", Path | None, None, "Write the result to this file too.")

@@ -1,5 +1,6 @@
 """Rigs from the terminal: the pages of a browser's devices are served while a rig needs them."""
 
+import math
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -20,6 +21,7 @@ PAGES = (
     Option("port", int, 8080, "Port of the pages, where projector or camera is one; 0 takes any free one."),
     Option("host", str, "127.0.0.1", "Address to serve the pages at: 0.0.0.0 for other computers and phones."),
     Option("tls", bool, False, "Encrypt the pages, as the browser of another device demands for its camera."),
+    Option("wait_s", float, PAGE_PATIENCE_S, "How long to wait until each page is opened and ready, in s."),
 )
 """How the pages of a rig's devices are served."""
 CHECKED = (
@@ -81,7 +83,8 @@ def _serve_pages(arguments: dict[str, Any]) -> Iterator["SetUp"]:
     from slviewer.pipeline.rig_choice import Board, Choice, RigSetup, list_needed_pages, set_up
     from slviewer.server.secure import Serving
 
-    serving = Serving(**{option.name: arguments.pop(option.name) for option in PAGES})
+    wait_s = arguments.pop("wait_s")
+    serving = Serving(**{option.name: arguments.pop(option.name) for option in PAGES if option.name in arguments})
     with ExitStack() as ended:
 
         def make(choice: Choice, board: Board | None) -> RigSetup:
@@ -92,12 +95,14 @@ def _serve_pages(arguments: dict[str, Any]) -> Iterator["SetUp"]:
             # with assumed sizes and without pages, so that what is impossible is refused before somebody walks there
             devices: dict[str, Any] = {role: {"size": [912, 1140], **choice[role]} for role in needed}
             set_up({**choice, **devices}, board, pages=PageChannels())
-            return set_up(choice, board, pages=_connect_pages(serving, needed, ended))
+            return set_up(choice, board, pages=_connect_pages(serving, needed, ended, wait_s))
 
         yield make
 
 
-def _connect_pages(serving: "Serving", needed: tuple["PageRole", ...], ended: ExitStack) -> "PageChannels":
+def _connect_pages(
+    serving: "Serving", needed: tuple["PageRole", ...], ended: ExitStack, wait_s: float
+) -> "PageChannels":
     """Serve the pages and return the channels to them, once those needed are ready. Raises DeviceError on timeout."""
     from slviewer.devices.browser import PageChannels
     from slviewer.server.device_pages import serve_device_pages
@@ -113,7 +118,7 @@ def _connect_pages(serving: "Serving", needed: tuple["PageRole", ...], ended: Ex
     if "camera" in needed:
         terminal.print_message(f"Open this on the phone or laptop that is the camera: {server.link('camera')}")
     reported = dict.fromkeys(needed, "")
-    for _ in range(int(PAGE_PATIENCE_S)):
+    for _ in range(math.ceil(wait_s)):
         states = {role: getattr(pages, role).page_state() for role in needed}
         if all(state.state == "ready" for state in states.values()):
             return pages
@@ -123,4 +128,4 @@ def _connect_pages(serving: "Serving", needed: tuple["PageRole", ...], ended: Ex
                 terminal.print_message(f"{role} page: {state.words}")
         getattr(pages, next(role for role in needed if states[role].state != "ready")).wait_ready(1.0)
     reasons = "; ".join(f"the {role} page: {state.words}" for role, state in states.items() if state.state != "ready")
-    raise DeviceError(f"not ready within {PAGE_PATIENCE_S:g} s: {reasons}")
+    raise DeviceError(f"not ready within {wait_s:g} s: {reasons}")

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from slviewer.errors import InputError
+from slviewer.errors import InputError, UsageError
 from slviewer.evaluation import letter
 from slviewer.pipeline.calibrate import calibrate
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings, part
@@ -30,6 +30,7 @@ def reproduce(
     out: Path | str | None = None,
     *,
     quick: bool = False,
+    scale: float | None = None,
     seed: int = 0,
     progress: Progress = ignore_progress,
     warn: Warn = ignore_warnings,
@@ -38,6 +39,7 @@ def reproduce(
 
     Args:
         quick: Half resolution; its figures are its own.
+        scale: Resolution of the camera, as a share of 1600x1200 px; by default 1, or 0.5 with --quick.
         out: Folder for the session and the report; by default reproduction, or reproduction-quick.
         seed: Another seed is another rig of the same kind.
 
@@ -45,7 +47,10 @@ def reproduce(
     """
     out = Path(out or ("reproduction-quick" if quick else "reproduction"))
     session = out / "session"
-    scale = QUICK_SCALE if quick else 1.0
+    if scale is None:
+        scale = QUICK_SCALE if quick else 1.0
+    elif quick:
+        raise UsageError(f"--quick is --scale {QUICK_SCALE:g}: give one of both")
     _simulate(session, scale, seed, part(progress, 0.0, 0.4))
     calibration = calibrate(session, TARGET, models=MODELS, progress=part(progress, 0.4, 0.65), warn=warn)
     assert calibration.pixelwise is not None

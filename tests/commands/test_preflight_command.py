@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from facts import missing_facts
 
 from slviewer.cli import main
 from slviewer.devices.drivers import Driver, drivers
@@ -46,7 +47,7 @@ def test_a_sound_rig(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     said = capsys.readouterr().out
     assert "good     screen: " in said and "settle_ms = " in said and "bad" not in said
     written = json.loads(found.read_text())
-    assert written["verdict"] == "good" and 0.1 < written["seconds"] < 300
+    assert written["verdict"] == "good" and 0.1 < written["seconds"] < 3600
     assert {check["name"] for check in written["checks"]} >= {"screen", "latency", "order", "flicker"}
 
 
@@ -68,7 +69,9 @@ def test_a_rig_that_is_not_fit_ends_with_1(
 class FailingCamera(BlindCamera):
     """Fails in the way of its maker's library, not of slviewer."""
 
-    fault: Exception
+    def __init__(self, fault: Exception) -> None:
+        super().__init__()
+        self.fault = fault
 
     def grab(self, out: np.ndarray) -> None:
         raise self.fault
@@ -84,16 +87,13 @@ def test_a_fault_of_a_driver_is_named_as_such(
     fault: Exception,
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(FailingCamera, "fault", fault, raising=False)
     lamp = preset_rig(scale=0.1).projector
-    monkeypatch.setitem(
-        drivers(), "failing", Driver("failing", "nothing", camera=FailingCamera, projector=lambda: lamp)
-    )
+    failing = Driver("failing", "nothing", camera=lambda: FailingCamera(fault), projector=lambda: lamp)
+    monkeypatch.setitem(drivers(), "failing", failing)
     Path("failing.toml").write_text(to_toml({"camera": {"driver": "failing"}, "projector": {"driver": "failing"}}))
     assert main([*command, "--rig", "failing.toml"]) == 1
     message = " ".join(capsys.readouterr().err.split())
-    assert f"the driver of the blind camera failed with {type(fault).__name__}: {fault}" in message
-    assert "report it to the driver's maker" in message
+    assert not missing_facts(message, "driver", "the blind camera", f"{type(fault).__name__}: {fault}", "maker")
 
 
 def test_a_rig_that_is_none_is_named(capsys: pytest.CaptureFixture[str]) -> None:

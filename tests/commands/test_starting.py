@@ -19,7 +19,7 @@ for arguments in (["--version"], ["--help"], ["import", "p18", "--help"], *([nam
 """
 
 
-@pytest.mark.computes
+@pytest.mark.process
 def test_help_imports_nothing_heavy_and_lists_every_command() -> None:
     run = subprocess.run([sys.executable, "-c", CODE], capture_output=True, text=True)
     assert run.returncode == 0, run.stderr

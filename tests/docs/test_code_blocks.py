@@ -1,7 +1,7 @@
 """The code blocks of README and docs work: commands and Python are run, TOML is read, or the reason why not is stated.
 
 A block that cannot be run follows a comment: <!-- not run: reason -->. The quick start is run with the built wheel, in
-tests/test_release.py. All pages work on one simulated session and share the names in it.
+tests/test_release.py. Most pages work on one simulated session and share the names in it; only -m slow runs them.
 """
 
 import inspect
@@ -31,6 +31,8 @@ BLOCK = re.compile(
     re.MULTILINE | re.DOTALL,
 )
 BOARD = "circles:21x16:9"
+WITHOUT_SESSION = {"choosing.md", "boards.md", "markers.md", "first-scan.md"}
+"""Pages whose commands need no session."""
 RIG = 'driver = "simulated"\nscale = 0.15\nthing = "stone"\n\n[turntable]\ndriver = "simulated"\n'
 
 
@@ -127,10 +129,22 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.computes
-@pytest.mark.parametrize("page", pages_with("bash"), ids=name_of)
+@pytest.mark.slow
+@pytest.mark.parametrize("page", [p for p in pages_with("bash") if p.name not in WITHOUT_SESSION], ids=name_of)
 def test_the_commands_of_a_page_run(page: Path, workspace: Path, tmp_path: Path, monkeypatch) -> None:
     shutil.copytree(workspace, tmp_path / "work")
     monkeypatch.chdir(tmp_path / "work")
+    run_blocks(page)
+
+
+@pytest.mark.parametrize("page", [p for p in pages_with("bash") if p.name in WITHOUT_SESSION], ids=name_of)
+def test_the_commands_of_a_page_without_a_session_run(page: Path, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    run_blocks(page)
+
+
+def run_blocks(page: Path) -> None:
+    """Run the commands of a page in the current folder, where its named TOML files are written first."""
     for block in blocks(page):
         if named := re.match(r"# (\S+\.toml)\n", block.code):
             Path(named[1]).write_text(block.code)
