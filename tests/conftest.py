@@ -4,9 +4,8 @@ import os
 import sys
 
 # Workers share the cores: libraries that each take all of them wait for one another.
-if "PYTEST_XDIST_WORKER" in os.environ:
-    for library in ("OMP", "OPENBLAS", "NUMBA"):
-        os.environ.setdefault(f"{library}_NUM_THREADS", "1")
+for library in ("OMP", "OPENBLAS", "NUMBA"):
+    os.environ.setdefault(f"{library}_NUM_THREADS", "1")
 
 import json
 import subprocess

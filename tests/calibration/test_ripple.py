@@ -8,7 +8,7 @@ from facts import missing_facts
 from splined_rig import BOARD, PERIOD, SAMPLE_PX, observation, poses, rig
 
 from slviewer.calibration.diagnosis.capture_rules import diagnose_period, diagnose_ripple
-from slviewer.calibration.diagnosis.evidence import AxisEvidence, Evidence, PoseEvidence
+from slviewer.calibration.diagnosis.evidence import AxisEvidence, Evidence, PoseEvidence, SolutionEvidence
 from slviewer.calibration.diagnosis.ripple import Ripple, measure_ripple
 from slviewer.calibration.diagnosis.solution import measure_solution
 from slviewer.calibration.diagnosis.verdict import Finding, Verdict, judge_splined
@@ -26,6 +26,8 @@ from slviewer.simulation.plans import target_poses
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import letter
 from slviewer.target.board import Board
+
+pytestmark = pytest.mark.computes
 
 
 @pytest.fixture(scope="module")
@@ -58,12 +60,19 @@ def test_a_ripple_is_measured_beside_what_lenses_leave(seen, stereo, waves: int)
         assert found.rms_px == pytest.approx(0.05, rel=0.1)
 
 
-def evidence(seen, stereo, ripple: dict, steps: int, period_seen: float = PERIOD) -> Evidence:
-    solution = replace(measure_solution(seen, stereo), ripple=ripple)
+@pytest.fixture(scope="module")
+def solution(seen, stereo) -> SolutionEvidence:
+    return measure_solution(seen, stereo)
+
+
+def evidence(solution: SolutionEvidence, ripple: dict, steps: int, period_seen: float = PERIOD) -> Evidence:
     axes = {axis: AxisEvidence(PERIOD, steps, 1.0, 0.0, np.nan, period_seen) for axis in "xy"}
     turn = ((1.0, 0.0), (0.0, 1.0))
     return Evidence(
-        str(BOARD), (912, 1140), tuple(PoseEvidence(o.name, axes=axes, turn=turn) for o in seen), solution=solution
+        str(BOARD),
+        (912, 1140),
+        tuple(PoseEvidence(name, axes=axes, turn=turn) for name in solution.used),
+        solution=replace(solution, ripple=ripple),
     )
 
 
@@ -71,22 +80,22 @@ def ripple(rms_px: float, waves: int, noise_px: float = 0.1) -> Ripple:
     return Ripple(rms_px, waves, rms_px, noise_px, mm_per_px=1.6, depth_mm=600.0)
 
 
-def test_as_many_waves_as_steps_are_gamma_and_few_are_changing_light(seen, stereo) -> None:
-    (found,) = diagnose_ripple(evidence(seen, stereo, {"x": ripple(0.4, 3)}, 3))
+def test_as_many_waves_as_steps_are_gamma_and_few_are_changing_light(solution) -> None:
+    (found,) = diagnose_ripple(evidence(solution, {"x": ripple(0.4, 3)}, 3))
     assert (found.cause, found.severity) == ("gamma", "doubtful")
     assert not missing_facts(found.sentence, 3, "0.40 px", "0.640 mm", "0.10 px", "0.160 mm")
-    (found,) = diagnose_ripple(evidence(seen, stereo, {"x": ripple(0.4, 1)}, 8))
+    (found,) = diagnose_ripple(evidence(solution, {"x": ripple(0.4, 1)}, 8))
     assert (found.cause, found.severity) == ("residuals", "doubtful") and "exposure" in found.text()
 
 
 @pytest.mark.parametrize(("rms_px", "noise_px"), [(0.02, 0.1), (0.01, 0.02), (0.01, 0.0)])
-def test_a_ripple_below_the_noise_or_of_no_size_is_no_finding(seen, stereo, rms_px: float, noise_px: float) -> None:
+def test_a_ripple_below_the_noise_or_of_no_size_is_no_finding(solution, rms_px: float, noise_px: float) -> None:
     """0.01 px are 16 um in depth here: an undisturbed rig at its noise floor shows as much."""
-    assert not list(diagnose_ripple(evidence(seen, stereo, {"x": ripple(rms_px, 3, noise_px)}, 3)))
+    assert not list(diagnose_ripple(evidence(solution, {"x": ripple(rms_px, 3, noise_px)}, 3)))
 
 
-def test_a_ripple_without_predicted_noise_is_named(seen, stereo) -> None:
-    found = diagnose_ripple(evidence(seen, stereo, {"x": ripple(0.1, 1, 0.0), "y": ripple(0.4, 3, 0.0)}, 3))
+def test_a_ripple_without_predicted_noise_is_named(solution) -> None:
+    found = diagnose_ripple(evidence(solution, {"x": ripple(0.1, 1, 0.0), "y": ripple(0.4, 3, 0.0)}, 3))
     assert [(f.cause, f.severity) for f in found] == [("gamma", "doubtful")]
 
 
@@ -102,7 +111,6 @@ def test_noise_is_predicted_where_every_pixel_is_black_in_a_step() -> None:
         assert a + 100 * b == pytest.approx(sigma**2 + 1 / 12, rel=0.15)
 
 
-@pytest.mark.computes
 def test_a_gamma_of_two_in_a_dark_room_is_named(tmp_path) -> None:
     """Every pixel of the boards is black in one of the 18 steps."""
     true = letter(0.2, 1, gamma=2.2)
@@ -116,10 +124,10 @@ def test_a_gamma_of_two_in_a_dark_room_is_named(tmp_path) -> None:
     assert verdict.level == "doubtful" and "gamma" in verdict.causes
 
 
-def test_a_ripple_is_not_taken_for_another_period(seen, stereo) -> None:
+def test_a_ripple_is_not_taken_for_another_period(solution) -> None:
     """By 0.17 px the code seems to begin elsewhere in the fringe."""
-    assert [f.cause for f in diagnose_period(evidence(seen, stereo, {}, 3, 13.4))] == ["fringe-period"]
-    assert not list(diagnose_period(evidence(seen, stereo, {"x": ripple(0.27, 3)}, 3, 13.4)))
+    assert [f.cause for f in diagnose_period(evidence(solution, {}, 3, 13.4))] == ["fringe-period"]
+    assert not list(diagnose_period(evidence(solution, {"x": ripple(0.27, 3)}, 3, 13.4)))
 
 
 def test_residuals_beyond_noise_are_doubtful_and_never_good() -> None:
