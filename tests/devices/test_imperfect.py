@@ -87,6 +87,7 @@ def test_mains_light_vanishes_in_an_exposure_of_its_period():
     assert swing(1.0) > 5 > 0.5 > swing(10.0)
 
 
+@pytest.mark.computes
 def test_a_display_that_scales_makes_fine_stripes_grey():
     rig = resampled_rig(SimulatedWorld(letter(0.1)), 1.1)
     with raises(InputError, "zoom", 3):

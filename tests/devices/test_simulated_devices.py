@@ -94,6 +94,7 @@ def test_the_same_captures_have_the_same_noise_previews_or_not(world):
     assert not np.array_equal(*stacks[0])
 
 
+@pytest.mark.computes
 def test_two_frames_of_one_pattern_differ_by_their_noise(rig):
     rig.projector.show_level(128)
     first, second = seen(rig).astype(float), seen(rig).astype(float)

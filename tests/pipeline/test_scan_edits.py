@@ -6,12 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from facts import missing_facts, raises
+from sound_checks import save_sound_checks
 
 from slviewer.cli import main
-from slviewer.devices.simulated import simulated_rig
-from slviewer.devices.world import SimulatedWorld
 from slviewer.errors import DamagedError, InputError, UsageError
-from slviewer.pipeline.capture import capture
 from slviewer.pipeline.certificate import verify_report
 from slviewer.pipeline.edit import edit_scan, set_region
 from slviewer.pipeline.export import export
@@ -21,7 +19,6 @@ from slviewer.pipeline.merge import merge
 from slviewer.pipeline.mesh import mesh
 from slviewer.pipeline.reconstruct import reconstruct
 from slviewer.pipeline.report import report
-from slviewer.pipeline.rig_choice import RigSetup
 from slviewer.pipeline.scan_edits import parse_region
 from slviewer.session.ply import read_ply
 from slviewer.session.scan_edits import load_edits, load_region
@@ -34,17 +31,18 @@ pytestmark = pytest.mark.computes
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory) -> Path:
-    """A session whose calibration is the truth, with two scans of the simulated object."""
+def made(recorded: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A session whose calibration is the truth, with the recorded scan of an object, twice in different noise."""
     folder = tmp_path_factory.mktemp("editing") / "session"
-    rig = letter(0.25)
-    true_calibration(folder, rig)
-    world = SimulatedWorld(rig)
-    for name, turn in (("one", 0.0), ("two", 6.0)):
-        world.place("object")
-        world.turn_table(turn)
-        bench = RigSetup(simulated_rig(world))
-        capture(folder, name, {}, role="scan", patterns="gray", set_up=lambda *_, bench=bench: bench)
+    true_calibration(folder, letter(0.25))
+    with Session.open(recorded / "session") as store:
+        scan = store.load_capture("object_r1")
+        frames = scan.frames
+    noise = np.random.default_rng(0).integers(0, 2, frames.shape, np.uint8)
+    with Session.open(folder, write=True) as store:
+        store.save_capture("one", "scan", scan.sequence, frames, source="recorded")
+        store.save_capture("two", "scan", scan.sequence, np.maximum(frames, noise) - noise, source="recorded")
+        save_sound_checks(store)
     return folder
 
 
@@ -119,21 +117,29 @@ def test_a_region_of_a_file_may_be_turned(session: Path, cloud: np.ndarray, tmp_
 
 
 def test_a_region_beside_the_scan_is_refused_with_numbers(session: Path, tmp_path: Path, capfd) -> None:
-    with Session.open(session) as store:
-        cloud = load_surface(store, "one").points
-    total, depths = count(cloud), cloud[..., 2][np.isfinite(cloud[..., 2])]
-    for compute in (
-        lambda: reconstruct(session, "one", roi="0,1,0,1,10,20"),
-        lambda: merge(session, ["two"], "one", tmp_path / "m.ply", start="identity", roi="0,1,0,1,10,20"),
-        lambda: measure(session, "one", "plane", ball=(0, 0, 500, 20), roi="0,1,0,1,10,20"),
+    facts = {}
+    for name in ("one", "two"):
+        cloud = load_surface(session, name).points
+        depths = cloud[..., 2][np.isfinite(cloud[..., 2])]
+        facts[name] = (name, f"{count(cloud)} points", f"z {depths.min():.0f} to {depths.max():.0f} mm")
+    box = "0,1,0,1,10,20"
+    for name, compute in (
+        ("one", lambda: reconstruct(session, "one", roi=box)),
+        ("two", lambda: merge(session, ["two"], "one", tmp_path / "m.ply", start="identity", roi=box)),
+        ("one", lambda: measure(session, "one", "plane", ball=(0, 0, 500, 20), roi=box)),
     ):
-        with raises(InputError, f"{total} points", f"z {depths.min():.0f} to {depths.max():.0f} mm"):
+        with raises(InputError, *facts[name]):
             compute()
-    for wrong in ("1,2,3", "0,1,5,4,1,2", "nan,1,0,1,0,1", str(tmp_path / "none.toml")):
-        with raises(UsageError, wrong):
+    for wrong, fact in (
+        ("1,2,3", "3 numbers"),
+        ("0,1,5,4,1,2", "0,1,5,4,1,2"),
+        ("nan,1,0,1,0,1", "--roi"),
+        (str(tmp_path / "none.toml"), "none.toml"),
+    ):
+        with raises(UsageError, fact):
             reconstruct(session, "one", roi=wrong)
     assert main(["reconstruct", str(session), "one", "--roi=-1,1,-1,1,10,20"]) == 1
-    assert not missing_facts(capfd.readouterr().err, f"{total} points")
+    assert not missing_facts(capfd.readouterr().err, *facts["one"])
     assert main(["region", str(session), "--roi=-500,500,-500,500,10,2000"]) == 0
     assert "1000.0 x 1000.0 x 1990.0 mm" in capfd.readouterr().out
 
@@ -150,8 +156,10 @@ def test_edits_are_stored_undone_and_redone(session: Path, cloud: np.ndarray, tm
     assert len(edited.edits) == 1 and f"{left:,}" in edited.edits[0]
     rows, columns = np.nonzero(np.isfinite(cloud[..., 2]) & (np.arange(w) > half[2]))
     part = (int(columns[500]), int(rows[500]))
-    with raises(InputError, "no point"):  # the object is one part
+    edit_scan(session, "one", part=part, invert=True)  # what is not connected with it
+    with raises(InputError, "no point"):
         edit_scan(session, "one", part=part, invert=True)
+    assert edit_scan(session, "one", undo=1).undone == 1
     edit_scan(session, "one", polygon=[0, -1, w, -1, w, rows[500], 0, rows[500]], invert=True)
     assert len(load(session).active) == 2
     assert edit_scan(session, "one", undo=2).undone == 2

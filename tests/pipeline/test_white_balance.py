@@ -44,6 +44,7 @@ def mean_colour(path: Path) -> np.ndarray:
     return np.asarray(image[image.max(axis=2) > 20].mean(axis=0))
 
 
+@pytest.mark.slow
 def test_the_texture_of_a_white_balanced_part_is_neutral(session: Path, tmp_path: Path) -> None:
     mesh(session, ["part"], tmp_path / "raw.glb", texture=512)
     mesh(session, ["part"], tmp_path / "white.glb", texture=512, white="card")

@@ -28,6 +28,11 @@ pytestmark = pytest.mark.computes
 SCALE = 0.1
 
 
+def slow(*values: object) -> Any:
+    """Parameters of a test that repeats in the slow tier what another one shows."""
+    return pytest.param(*values, marks=pytest.mark.slow)
+
+
 def world(**how) -> SimulatedWorld:
     return SimulatedWorld(letter(SCALE, **how))
 
@@ -68,7 +73,7 @@ def compiled(looked: Looked) -> None:
     looked(simulated_rig(world()))
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, slow(1), slow(2)])
 def test_a_sound_rig_is_left_in_peace(seed, looked, compiled):
     said: list[str] = []
     done: list[float] = []
@@ -116,7 +121,7 @@ def test_latency_is_measured_and_waited_for(looked, lying):
     assert found.settle_ms >= figures["latency_ms"]
 
 
-@pytest.mark.parametrize("images", [1, 2])
+@pytest.mark.parametrize("images", [1, slow(2)])
 def test_a_camera_that_is_behind_is_named(images, looked, lying):
     found = looked(lying(lag=images))
     assert wrong_with(found) == {"latency", "order"}
@@ -128,9 +133,9 @@ def test_a_camera_that_is_behind_is_named(images, looked, lying):
     ("wrong", "names", "facts"),
     [
         ({"late": {9}}, {"order"}, ("frame 10", "frame 9")),
-        ({"late": {3}}, {"order"}, ("frame 4", "level")),
+        slow({"late": {3}}, {"order"}, ("frame 4", "level")),
         ({"repeated": {9}}, {"order", "repeats"}, ("frame 10", "frame 9")),
-        ({"dropped": 10}, {"order"}, ("frame 11", "missing")),
+        slow({"dropped": 10}, {"order"}, ("frame 11", "missing")),
         ({"swapped": 8}, {"order"}, ("frames 9 and 10", "places")),
     ],
 )
@@ -165,7 +170,7 @@ def test_a_wrong_exposure_is_named_with_a_better_one(exposure_ms, verdict, time)
         assert found.verdict == "good"
 
 
-@pytest.mark.parametrize(("hertz", "exposure"), [(100.0, "10 ms"), (120.0, "8.33 ms")])
+@pytest.mark.parametrize(("hertz", "exposure"), [(100.0, "10 ms"), slow(120.0, "8.33 ms")])
 def test_mains_light_is_named_with_its_frequency(hertz, exposure, looked, lying):
     found = looked(lying(room=25, mains_depth=0.4, mains_hz=hertz))
     flicker = found.check("flicker")

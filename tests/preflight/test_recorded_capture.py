@@ -49,7 +49,9 @@ def gained(stack: np.ndarray, gain: float | np.ndarray, offset: float = 0.0) -> 
     return np.clip(np.rint(stack * gain + offset), 0, 255).astype(np.uint8)
 
 
-@pytest.mark.parametrize("sequence_of", [complementary, gray, p18])
+@pytest.mark.parametrize(
+    "sequence_of", [p18, *(pytest.param(each, marks=pytest.mark.slow) for each in (complementary, gray))]
+)
 def test_a_sound_capture_is_good(tmp_path: Path, sequence_of: Callable) -> None:
     found = checked(tmp_path / "session", *frames_of(sequence_of))
     assert found.verdict == "good", [vars(check) for check in found.checks if check.verdict != "good"]
@@ -60,7 +62,12 @@ def test_a_sound_capture_is_good(tmp_path: Path, sequence_of: Callable) -> None:
 
 
 @pytest.mark.parametrize(
-    ("wrong", "frame"), [({"swapped": 4}, 5), ({"repeated": frozenset({10})}, 11), ({"lag": 1}, 2)]
+    ("wrong", "frame"),
+    [
+        ({"repeated": frozenset({10})}, 11),
+        pytest.param({"swapped": 4}, 5, marks=pytest.mark.slow),
+        pytest.param({"lag": 1}, 2, marks=pytest.mark.slow),
+    ],
 )
 def test_the_order_is_checked(tmp_path: Path, wrong: dict, frame: int) -> None:
     found = checked(tmp_path / "session", *frames_of(p18, **wrong))

@@ -86,6 +86,7 @@ def test_html_in_a_page_is_shown_as_text(folder):
     assert 'href="https://example.org" target="_blank" rel="noopener noreferrer"' in html
 
 
+@pytest.mark.computes
 def test_every_shipped_page_renders():
     pages = HelpPages()
     for name in pages.names:

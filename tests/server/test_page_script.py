@@ -11,16 +11,17 @@ from playwright.sync_api import Browser
 from slviewer.server.viser_internals import PAGE_SCRIPT, client_page
 
 WORKER = """async () => {
-  const request = function request(address) {
-    const sent = new XMLHttpRequest();
-    sent.open("GET", address, false);
-    sent.send();
-  };
-  const text = `for (let i = 0; i < 20; i++)
-    postMessage(i === 7 ? {type: "closed"} : {type: "message_batch", messages: [2 * i, 2 * i + 1]});
-  ${request.toString()}
-  request("${location.origin}/sent");`;
+  const text = `onmessage = ({data: shared}) => {
+    postMessage("ready");
+    Atomics.wait(shared, 0, 0);
+    for (let i = 0; i < 20; i++)
+      postMessage(i === 7 ? {type: "closed"} : {type: "message_batch", messages: [2 * i, 2 * i + 1]});
+    Atomics.store(shared, 1, 1);
+  };`;
   const worker = new Worker(URL.createObjectURL(new Blob([text])));
+  const [begin, sent] = [0, 1], shared = new Int32Array(new SharedArrayBuffer(8));
+  worker.postMessage(shared);
+  await new Promise((ready) => worker.addEventListener("message", ready, { once: true }));
   const arrived = [];
   let failed = false;
   window.onerror = () => (failed = true);
@@ -31,25 +32,26 @@ WORKER = """async () => {
       if (data.type === "closed") throw new Error("in the page");
     };
   });
-  request("/wait"); // the page is busy until the worker has sent all
+  Atomics.store(shared, begin, 1);
+  Atomics.notify(shared, begin);
+  const end = performance.now() + HANG_MS;
+  while (!Atomics.load(shared, sent) && performance.now() < end); // the page is busy until the worker has sent all
   await done;
   return { arrived, failed };
-}"""
+}""".replace("HANG_MS", f"{1000 * HANG_S:.0f}")
 
 
 @pytest.fixture
-def address() -> Iterator[str]:
-    """A server whose `/wait` is answered once `/sent` was requested."""
-    sent = threading.Event()
+def isolated_address() -> Iterator[str]:
+    """The address of an empty page that may share memory with its workers."""
 
     class Handler(BaseHTTPRequestHandler):
         def do_GET(self) -> None:
-            if self.path == "/sent":
-                sent.set()
-            elif self.path == "/wait":
-                sent.wait(HANG_S)
             self.send_response(200)
             self.send_header("Content-Length", "0")
+            self.send_header("Content-Type", "text/html")
+            self.send_header("Cross-Origin-Opener-Policy", "same-origin")
+            self.send_header("Cross-Origin-Embedder-Policy", "require-corp")
             self.end_headers()
 
         def log_message(self, *_: object) -> None:
@@ -58,15 +60,14 @@ def address() -> Iterator[str]:
     server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
     threading.Thread(target=server.serve_forever, daemon=True).start()
     yield f"http://127.0.0.1:{server.server_port}/"
-    sent.set()
     server.shutdown()
     server.server_close()
 
 
-def test_batches_that_wait_are_one_and_keep_their_order(browser: Browser, address: str) -> None:
+def test_batches_that_wait_are_one_and_keep_their_order(browser: Browser, isolated_address: str) -> None:
     context = browser.new_context()
     page = context.new_page()
-    page.goto(address)
+    page.goto(isolated_address)
     page.add_script_tag(content=PAGE_SCRIPT.decode())
     found = page.evaluate(WORKER)
     context.close()
