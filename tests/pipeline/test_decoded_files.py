@@ -68,7 +68,7 @@ def read_exr(path: Path) -> np.ndarray:
     return np.stack([np.frombuffer(data, "<f4", width, offset + 8) for offset in offsets])
 
 
-@pytest.mark.parametrize("file_format", ["npy", "exr"])
+@pytest.mark.parametrize("file_format", [pytest.param("npy", marks=pytest.mark.slow), "exr"])
 def test_files_hold_what_was_decoded(tmp_path: Path, run: Run, part: Captured, file_format: str) -> None:
     session, out = recorded_session(tmp_path / "session", *part), tmp_path / "out"
     with Session.open(session, write=True) as store:

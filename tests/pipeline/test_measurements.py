@@ -271,6 +271,7 @@ def test_a_merge_is_measured_on_too(folder, balls, regions) -> None:
         measurements.add_relation(folder, one.id, other.id)
 
 
+@pytest.mark.slow
 def test_measurements_are_repeated_by_a_plan(made: Path, run: Run, tmp_path: Path) -> None:
     session = tmp_path / "parts" / "one"
     shutil.copytree(made, session)

@@ -67,7 +67,7 @@ def test_the_wizard_opens_a_session_of_another_version_and_says_what_to_do(recor
         assert shown.session.calibration.stereo.reprojection_rms_px
 
 
-@pytest.mark.parametrize("name", ["pixelwise", "splined"])
+@pytest.mark.parametrize("name", ["pixelwise", pytest.param("splined", marks=pytest.mark.slow)])
 def test_a_calibration_is_loaded_again_only_when_it_has_changed(recorded: Path, tmp_path: Path, name: str) -> None:
     folder = Path(shutil.copytree(recorded / "session", tmp_path / "session"))
     with Session.open(folder, write=True) as store:

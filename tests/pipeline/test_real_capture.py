@@ -9,7 +9,7 @@ import trimesh
 
 from slviewer.cli import main
 
-pytestmark = pytest.mark.computes
+pytestmark = [pytest.mark.computes, pytest.mark.slow]  # two calibrations from large photographs
 
 
 @pytest.fixture(scope="module")
