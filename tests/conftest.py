@@ -1,4 +1,5 @@
 """What all tests may use."""
+# ruff: noqa: E402 (the number of threads is read where libraries are imported)
 
 import os
 import sys

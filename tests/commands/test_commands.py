@@ -73,6 +73,7 @@ def test_reconstruct_a_board_pose_and_a_scan(calibrated: dict, session: Path, ru
     assert status == 1 and "axis" in error
 
 
+@pytest.mark.slow
 def test_a_mesh_with_a_texture(calibrated: dict, session: Path, run: Run, tmp_path: Path) -> None:
     out = tmp_path / "part.glb"
     status, text, _ = run("mesh", session, "object_r2", "--texture", "512", "--model", "stereo", "--out", out)

@@ -66,6 +66,7 @@ def test_a_notebook_runs(figures: ModuleType, notebook: Path, tmp_path: Path) ->
     assert pictures or notebook.stem == "live_cloud"
 
 
+@pytest.mark.slow
 def test_the_notebook_of_a_live_cloud_runs_on_a_simulated_session(
     figures: ModuleType,
     recorded: Path,

@@ -119,9 +119,8 @@ def test_limits_are_decided_with_a_guard_band(value: float, decision: str) -> No
 @pytest.mark.parametrize(
     "kind",
     [
-        "position",
         *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("flatness", "roundness", "cylindricity")),
-        *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("parallelism", "profile")),
+        *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("parallelism", "profile", "position")),
     ],
 )
 def test_uncertainty_covers_the_truth_of_drawn_parts(kind: str) -> None:
