@@ -116,13 +116,8 @@ def test_limits_are_decided_with_a_guard_band(value: float, decision: str) -> No
     assert judge_limits(float("nan"), 0.1, 4.0, 6.0) == "undecided"
 
 
-@pytest.mark.parametrize(
-    "kind",
-    [
-        *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("flatness", "roundness", "cylindricity")),
-        *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("parallelism", "profile", "position")),
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["flatness", "roundness", "cylindricity", "parallelism", "position", "profile"])
 def test_uncertainty_covers_the_truth_of_drawn_parts(kind: str) -> None:
     cases = [CASES[kind](40, np.random.default_rng([77, i])) for i in range(30)]
     errors = np.array([(q.value - truth) / (q.U or np.inf) for truth, q in cases])

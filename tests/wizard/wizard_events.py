@@ -1,24 +1,21 @@
 """What tests of the wizard share: a timing that spares the machine, and waits for events instead of times."""
 
-import time
 from collections.abc import Callable
+
+import clocks
+from clocks import HANG_S
 
 from slviewer.wizard.operator import Operator
 from slviewer.wizard.snapshot import Level, Snapshot
 from slviewer.wizard.timing import Timing
 
-HANG_S = 900.0
-"""Ends a test that hangs; nothing that works takes as long on the slowest machine."""
 SPARING = Timing(retry_s=0.1, previews_per_s=1.0, trials=20)
 """Nobody looks at the previews, and the best of fewer poses does."""
 
 
 def until(condition: Callable[[], bool]) -> None:
     """Wait until a condition holds that other threads fulfil."""
-    end = time.monotonic() + HANG_S
-    while not condition():
-        assert time.monotonic() < end, "it never happened"
-        time.sleep(0.005)
+    assert clocks.until(condition), "it never happened"
 
 
 def wait_until_open(operator: Operator) -> None:
