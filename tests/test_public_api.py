@@ -48,6 +48,7 @@ def figures(text: str) -> list[float]:
     return [float(number) for number in re.findall(r"\d+\.\d+", text)]
 
 
+@pytest.mark.slow
 @pytest.mark.computes
 def test_arrays_are_measured_without_a_session(images: Path, tmp_path: Path, run: Run) -> None:
     said = run("arrays.py", images, BOARD, tmp_path / "errors.png")
@@ -56,6 +57,7 @@ def test_arrays_are_measured_without_a_session(images: Path, tmp_path: Path, run
     assert (tmp_path / "errors.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.slow
 @pytest.mark.computes
 def test_a_session_is_made_and_measured(images: Path, tmp_path: Path, run: Run) -> None:
     said = run("session.py", images, BOARD, tmp_path / "session")

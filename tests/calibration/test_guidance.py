@@ -63,6 +63,7 @@ def test_the_gain_of_a_pose_is_what_it_will_bring(bench, known) -> None:
     assert (after.variances <= before.variances * (1 + 1e-6)).all()
 
 
+@pytest.mark.slow
 @pytest.mark.computes
 def test_guided_poses_are_seen_and_know_more_than_others(true, bench, known) -> None:
     had = known[1][:3]
@@ -92,6 +93,7 @@ def test_noise_that_was_seen_is_expected() -> None:
     assert noisy.sample == pytest.approx(3 * usual.sample) and noisy.feature == pytest.approx(3 * usual.feature)
 
 
+@pytest.mark.slow
 @pytest.mark.computes
 def test_a_plan_asks_until_the_wanted_sigma_is_reached(true, seen) -> None:
     sizes = true.camera.size, true.projector.size

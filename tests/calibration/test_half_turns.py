@@ -45,6 +45,7 @@ def calibrated(seen: list[Observation], true) -> SplinedModel:
     return calibrate_splined(seen, calibrate_stereo(seen, true.projector.size, str(BOARD)), cells_across=CELLS)
 
 
+@pytest.mark.slow
 def test_turned_poses_are_found_and_change_nothing(seen, mixed, true) -> None:
     as_held, found = calibrated(seen, true), calibrated(mixed, true)
     assert as_held.bundle.half_turned_poses == () and found.bundle.half_turned_poses == tuple(

@@ -49,6 +49,7 @@ def test_the_fit_reproduces_the_clouds_pixels(models, true) -> None:
     assert 0.0 < projector.rms_px < 0.1 and 0.2 < projector.share < 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.computes
 def test_what_a_lens_cannot_express_is_stated() -> None:
     _, splined = _bent()

@@ -111,6 +111,7 @@ def test_noise_is_predicted_where_every_pixel_is_black_in_a_step() -> None:
         assert a + 100 * b == pytest.approx(sigma**2 + 1 / 12, rel=0.15)
 
 
+@pytest.mark.slow
 def test_a_gamma_of_two_in_a_dark_room_is_named(tmp_path) -> None:
     """Every pixel of the boards is black in one of the 18 steps."""
     true = letter(0.2, 1, gamma=2.2)

@@ -82,6 +82,7 @@ def test_weights_come_from_the_residuals(model) -> None:
     assert "splined" in model.text() and not model.bundle.excluded
 
 
+@pytest.mark.slow
 def test_a_pose_that_moved_during_its_capture_is_named_and_changes_nothing(model, seen, stereo, true) -> None:
     moved = observation(true, poses(true, 12)[5], "pose_05", SHAPE, moved_mm=0.5)
     bundle = adjust_bundle([moved if o.name == "pose_05" else o for o in seen], stereo, cells_across=CELLS)
@@ -92,6 +93,7 @@ def test_a_pose_that_moved_during_its_capture_is_named_and_changes_nothing(model
     assert np.nanstd(good - other) < 0.01
 
 
+@pytest.mark.slow
 def test_poses_read_with_more_noise_count_less_and_do_not_pass_for_moved(seen, stereo) -> None:
     rng = np.random.default_rng(1)
     noisy = ("pose_02", "pose_07")
@@ -102,6 +104,7 @@ def test_poses_read_with_more_noise_count_less_and_do_not_pass_for_moved(seen, s
     assert bundle.noise.camera_px < 0.013  # that of the others
 
 
+@pytest.mark.slow
 def test_where_no_pose_looked_points_are_masked_unless_asked_for(seen, stereo, true) -> None:
     left = [replace(o, samples=_left_of(o, 0.6 * true.camera.size[0])) for o in seen]
     model = SplinedModel(adjust_bundle(left, stereo, cells_across=CELLS))

@@ -125,6 +125,7 @@ def test_a_displacement_and_its_inverse(true) -> None:
     assert np.isclose(constant @ form @ constant, 0.05 * len(form)) and np.linalg.eigvalsh(form)[0] > 0
 
 
+@pytest.mark.slow
 @pytest.mark.computes
 def test_the_compiled_form_is_the_exact_one(model, true) -> None:
     state = model.rig

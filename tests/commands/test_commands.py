@@ -104,6 +104,7 @@ def test_merge_the_object(calibrated: dict, session: Path, run: Run, tmp_path: P
     assert status == 0 and len(np.loadtxt(tmp_path / "all.xyz")) == json.loads(out.read_text())["points"]
 
 
+@pytest.mark.slow
 def test_mesh_of_one_scan_and_of_scans_merged_on_the_way(
     calibrated: dict, session: Path, run: Run, tmp_path: Path
 ) -> None:

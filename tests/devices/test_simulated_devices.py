@@ -156,6 +156,7 @@ def test_moving_the_board_changes_the_next_frame(world, rig):
         assert np.array_equal(world.pose.t, pose.t)
 
 
+@pytest.mark.slow
 @pytest.mark.computes
 def test_a_draft_shows_the_board_where_it_is_and_captures_are_never_drafts():
     time = SteppingClock()

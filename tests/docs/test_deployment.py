@@ -47,6 +47,7 @@ def test_the_unit_starts_a_known_command_as_another_user() -> None:
     assert program == "/opt/slviewer/bin/slviewer" and command == "wizard"
 
 
+@pytest.mark.slow
 @pytest.mark.process
 def test_the_image_s_command_serves_and_its_health_check_passes(tmp_path: Path) -> None:
     Session.create(tmp_path / "session").close()

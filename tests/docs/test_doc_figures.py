@@ -18,6 +18,7 @@ def run(figures: ModuleType, monkeypatch: pytest.MonkeyPatch) -> Callable[..., i
     return script
 
 
+@pytest.mark.slow
 @pytest.mark.computes
 def test_the_quick_figures_are_right(run: Callable[..., int], capsys: pytest.CaptureFixture[str]) -> None:
     assert run("--check") == 0, capsys.readouterr().out

@@ -102,6 +102,7 @@ def test_its_parts_are_listed(example: None, run: Run) -> None:
     assert "hotfolder (camera, projector)" in listed and "tcpturntable (turntable)" in listed
 
 
+@pytest.mark.slow
 @pytest.mark.computes
 def test_its_importer_and_exporter_work_in_commands(example: None, tmp_path: Path, run: Run) -> None:
     frames = [

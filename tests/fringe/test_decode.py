@@ -93,6 +93,7 @@ def test_frames_may_come_in_any_order():
     np.testing.assert_array_equal(phase.phase, expected.phase)
 
 
+@pytest.mark.slow
 @pytest.mark.computes
 def test_deeper_grey_levels():
     truth, sequence = slope(), SEQUENCES["p18"]

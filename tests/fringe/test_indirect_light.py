@@ -43,6 +43,7 @@ def captured(scene, sequence_of):
     return sequence, renderer_of(scene).capture(sequence, 1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sequence_of", variants([p18, multifrequency], p18))
 def test_points_of_a_wrong_period_are_masked_in_a_groove(sequence_of):
     sequence, frames = captured(MISLED, sequence_of)

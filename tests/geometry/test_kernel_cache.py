@@ -56,6 +56,7 @@ def read_only(install: Path) -> None:
     (install / "slviewer" / "__pycache__").touch()
 
 
+@pytest.mark.slow
 @pytest.mark.process
 @pytest.mark.computes
 def test_another_files_change_is_seen_and_code_is_compiled_once(install: Path, tmp_path: Path) -> None:

@@ -41,6 +41,7 @@ def test_wizard_serves_projector_page(browser: Browser) -> None:
             app.close()
 
 
+@pytest.mark.slow
 def test_wizard_without_page_channel_has_no_projector_page(browser: Browser) -> None:
     with Operator(timing=CALM) as operator:
         app = App(operator, Serving(port=0))

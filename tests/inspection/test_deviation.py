@@ -129,6 +129,7 @@ def test_a_bump_of_a_tenth_is_seen_within_5_microns() -> None:
     assert judge_deviation(found, np.full(len(points), 0.01), verdict.highest[0]).decision == "undecided"
 
 
+@pytest.mark.slow
 @pytest.mark.computes
 def test_a_part_that_looks_alike_from_two_sides_is_placed_on_either() -> None:
     box = trimesh.creation.box((60, 40, 20))

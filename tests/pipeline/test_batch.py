@@ -213,6 +213,7 @@ def test_a_killed_worker_costs_a_retry(session: Path, meshes: dict[str, bytes], 
     assert len(read_ply(session / "exports" / "plane_03_stereo_mesh.ply").faces) > 10_000
 
 
+@pytest.mark.slow
 @pytest.mark.process
 @pytest.mark.computes
 def test_workers_of_its_own(session: Path, clouds: dict[str, bytes], capsys: pytest.CaptureFixture[str]) -> None:

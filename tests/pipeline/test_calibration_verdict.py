@@ -117,6 +117,7 @@ def test_a_rejected_calibration_is_kept_and_refused(bench: FaultBench, made: Pat
     assert run("reconstruct", session, *pose)[0] == 0 and ply.exists()
 
 
+@pytest.mark.slow
 def test_where_nothing_came_of_it_the_session_keeps_what_it_had(session: Path, tmp_path: Path, run: Run) -> None:
     status, _, error = run("calibrate", session, "--target", "circles:20x16:9", "--poses", "pose_0[1-4]")
     assert status == 3 and not missing_facts(error, "21x16", "20x16")

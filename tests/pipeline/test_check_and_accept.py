@@ -156,6 +156,7 @@ def capture_board(folder: Path, name: str) -> None:
         store.save_capture(name, "scan", sequence, frames, source="simulated")
 
 
+@pytest.mark.slow
 def test_check_finds_a_projector_that_was_turned(calibrated: Path) -> None:
     capture_board(calibrated, "panned")
     panned = check(calibrated, "panned")

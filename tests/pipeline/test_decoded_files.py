@@ -68,6 +68,7 @@ def read_exr(path: Path) -> np.ndarray:
     return np.stack([np.frombuffer(data, "<f4", width, offset + 8) for offset in offsets])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("file_format", [pytest.param("npy", marks=pytest.mark.slow), "exr"])
 def test_files_hold_what_was_decoded(tmp_path: Path, run: Run, part: Captured, file_format: str) -> None:
     session, out = recorded_session(tmp_path / "session", *part), tmp_path / "out"
@@ -114,6 +115,7 @@ def test_gray_code_alone_states_its_quantisation(tmp_path: Path, run: Run) -> No
     )
 
 
+@pytest.mark.slow
 def test_frames_that_do_not_fit_are_reported(tmp_path: Path, run: Run, part: Captured) -> None:
     sequence, stack = part
     order = np.arange(len(stack))

@@ -154,6 +154,7 @@ def test_a_capture_that_arrives_later_contradicts_a_calibration(run: Run, tmp_pa
     assert status == 1 and not missing_facts(err, "wall", "R", "T", "inverted"), err
 
 
+@pytest.mark.slow
 def test_sizes_that_contradict_each_other_are_refused(session: Path, run: Run, tmp_path: Path) -> None:
     path = file(tmp_path, entries(), cam_size=np.array([320, 240]), pro_size=np.array(PROJECTOR))
     status, _, err = run("import", "opencv-calibration", path, session)

@@ -57,6 +57,7 @@ def unchanged(err: str) -> set[str]:
     return set(re.findall(r"capture_\d", warning))
 
 
+@pytest.mark.slow
 def test_an_import_that_is_repeated_adds_what_is_missing(run: Run, tmp_path: Path) -> None:
     write_captures(tmp_path / "source", 3)
     session, options = tmp_path / "session", ("--projector", "120x90")

@@ -100,6 +100,7 @@ def test_a_wrong_plan_is_refused_by_name(tmp_path: Path, old: str, new: str, nam
         read_plan(tmp_path / "plan.toml")
 
 
+@pytest.mark.slow
 @pytest.mark.computes
 @pytest.mark.parametrize(
     ("count", "wrong"), [(6, {1: 1, 4: -1}), pytest.param(20, {3: 1, 8: -1, 13: 1, 17: -1}, marks=pytest.mark.slow)]
@@ -129,6 +130,7 @@ def test_exactly_the_parts_out_of_tolerance_fail(tmp_path: Path, count: int, wro
     assert [row["part"] for row in rows if row["decision"] == "fail"] == [f"part {k}" for k in wrong]
 
 
+@pytest.mark.slow
 @pytest.mark.computes
 def test_what_cannot_be_measured_is_named_and_takes_nothing_with_it(tmp_path: Path) -> None:
     plan = make_plan()
@@ -157,6 +159,7 @@ def test_capability_of_known_spread() -> None:
     assert process_capability([1.0, 2.0], 0.0, 2.0) is None
 
 
+@pytest.mark.slow
 @pytest.mark.computes
 def test_a_plan_by_best_fit_measures_profiles_from_the_nominal_model(tmp_path: Path) -> None:
     """The nominal is a block with one sloping side; the part lies elsewhere, with a dent of 0.2 mm in its top."""

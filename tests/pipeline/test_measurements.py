@@ -145,6 +145,7 @@ def test_measurements_are_renamed_deleted_and_brought_back(folder, balls, tops) 
         measurements.relabel_measurement(folder, "m9", "x")
 
 
+@pytest.mark.slow
 def test_a_measurement_is_stale_when_its_scan_or_what_it_was_made_from_changed(folder, balls, regions) -> None:
     fits = [measurements.add_fit(folder, balls, "sphere", ball_about(balls, region)) for region in regions]
     measurements.add_relation(folder, fits[0].id, fits[1].id)
@@ -179,6 +180,7 @@ def test_what_cannot_be_measured_is_refused_and_nothing_is_kept(folder, balls, r
     assert len(measurements.load_measurements(folder)) == 2
 
 
+@pytest.mark.slow
 def test_a_scan_is_compared_with_its_nominal_from_the_command_line(folder, run: Run, tmp_path, balls, tops) -> None:
     ammonite = asset("objects/ammonite.ply")
     arguments = ("compare", folder, "object", ammonite, "--tolerance", 1.5, "--json", tmp_path / "c.json")
@@ -217,6 +219,7 @@ def test_a_damaged_measurement_is_told_not_guessed(folder, balls, tops) -> None:
         measurements.section_lines(folder, one.id)
 
 
+@pytest.mark.slow
 def test_the_terminal_measures_relates_names_and_writes_a_table(folder, balls, run: Run, tmp_path, tops) -> None:
     (u, v), (x, y) = tops
     for centre, name in zip(CENTRES, ("left", "right"), strict=True):

@@ -73,6 +73,7 @@ def test_a_plate_is_merged_by_its_markers(tmp_path: Path) -> None:
     assert "Common markers" in merge_html(view, {})
 
 
+@pytest.mark.slow
 @pytest.mark.computes
 def test_scans_without_markers_are_refused_with_what_to_do(tmp_path: Path) -> None:
     session = tmp_path / "session"

@@ -25,6 +25,7 @@ def test_a_calibration_of_another_layout_is_refused_with_what_to_do(tmp_path: Pa
             load_model(store, name)
 
 
+@pytest.mark.slow
 def test_a_calibration_of_a_model_that_is_no_more_is_ignored(recorded: Path, tmp_path: Path) -> None:
     folder = Path(shutil.copytree(recorded / "session", tmp_path / "session"))
     with Session.open(folder, write=True) as store:
@@ -53,6 +54,7 @@ def test_what_is_stale_is_told_in_one_sentence(tmp_path: Path) -> None:
     assert not missing_facts(sentence, "stereo", "splined")
 
 
+@pytest.mark.slow
 def test_the_wizard_opens_a_session_of_another_version_and_says_what_to_do(recorded: Path, tmp_path: Path) -> None:
     folder = Path(shutil.copytree(recorded / "session", tmp_path / "session"))
     shutil.rmtree(folder / "results" / "calibration" / "splined")
@@ -79,6 +81,7 @@ def test_a_calibration_is_loaded_again_only_when_it_has_changed(recorded: Path, 
         assert load_model(store, name) is not first
 
 
+@pytest.mark.slow
 def test_what_a_calibration_compiles_is_saved_and_belongs_to_it_alone(
     recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -33,6 +33,7 @@ def test_it_calibrates_as_well_as_plain_opencv(kamino: Path, board: str) -> None
     assert len(found["poses_used"]) == 5
 
 
+@pytest.mark.slow
 def test_poses_give_the_board(kamino: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for k in (0, 4):
         ply = tmp_path / f"{k}.ply"

@@ -75,6 +75,7 @@ def count(points: np.ndarray) -> int:
     return int(np.isfinite(points).all(axis=-1).sum())
 
 
+@pytest.mark.slow
 def test_every_command_uses_the_region_of_the_session(session: Path, cloud: np.ndarray, tmp_path: Path) -> None:
     total = count(cloud)
     text = set_region(session, roi=middle_half(cloud))
@@ -116,6 +117,7 @@ def test_a_region_of_a_file_may_be_turned(session: Path, cloud: np.ndarray, tmp_
         parse_region(str(file))
 
 
+@pytest.mark.slow
 def test_a_region_beside_the_scan_is_refused_with_numbers(session: Path, tmp_path: Path, capfd) -> None:
     facts = {}
     for name in ("one", "two"):

@@ -64,6 +64,7 @@ def largest_error(clouds: dict[str, Cloud], T: np.ndarray, true: np.ndarray) -> 
     return float(np.linalg.norm(move_points(T, points) - move_points(true, points), axis=1).max())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("make", "behind_mm", "reason"),
     [(marked_sphere, 60.0, "sphere"), pytest.param(marked_cylinder, 0.0, "cylinder", marks=pytest.mark.slow)],
@@ -85,6 +86,7 @@ def test_markers_register_shapes_that_hold_no_pose(
     assert registration.start == "markers" and registration.overlap > 0.5
 
 
+@pytest.mark.slow
 def test_a_plane_and_its_corners(plates, on_plates) -> None:
     assert all(len(markers.ids) == 6 and not markers.repeated for markers in on_plates.values())
     alignment = register_all(plates, "a", Starts(markers=on_plates))

@@ -79,6 +79,7 @@ def test_edges_are_not_trusted(clouds: dict[str, Cloud]) -> None:
     assert at_rim.any() and not scan.trusted[at_rim].any() and scan.trusted.mean() > 0.9
 
 
+@pytest.mark.slow
 def test_a_scan_that_does_not_belong_is_named() -> None:
     scans = {"a": Scan(view(bumpy(2), (-75, 45), 2)), "stranger": Scan(view(bumpy(58), (-45, 75), 1))}
     with raises(Refused, "stranger"):

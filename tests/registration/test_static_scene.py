@@ -67,6 +67,7 @@ def scans(deg: float, wall: bool) -> tuple[dict[str, Cloud], dict[str, np.ndarra
     return clouds, {name: cloud.points[..., 2] > 700 for name, cloud in clouds.items()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("deg", [pytest.param(2.0, marks=pytest.mark.slow), 25.0])
 def test_a_wall_behind_a_turned_object_is_recognised_and_does_not_move_it(deg: float) -> None:
     alone, _ = scans(deg, wall=False)
@@ -84,6 +85,7 @@ def test_a_wall_behind_a_turned_object_is_recognised_and_does_not_move_it(deg: f
     assert 0 <= found.contradictions["b", "a"].share < 0.02
 
 
+@pytest.mark.slow
 def test_an_object_alone_has_nothing_that_stands_still() -> None:
     clouds, _ = scans(25.0, wall=False)
     found = register_object(clouds, "a")

@@ -100,6 +100,7 @@ def test_one_limit_for_many_figures() -> None:
     assert maps.error_limit([np.full((4, 4), np.nan)]) == 1.0
 
 
+@pytest.mark.slow
 def test_nothing_measured_is_drawn_as_nothing() -> None:
     empty = np.full((60, 80), np.nan, np.float32)
     opened(maps.error_maps("pose", {"stereo": empty}, {"stereo": float("nan")}))
@@ -112,6 +113,7 @@ def test_scales_end_at_round_values() -> None:
     assert [round_up(v) for v in (0.011, 0.4, 7, 0.95, float("nan"))] == pytest.approx([0.015, 0.4, 8, 1, 1])
 
 
+@pytest.mark.slow
 def test_the_pixels_curve_and_its_residuals() -> None:
     figure = pixel_curves(pixel_curve())
     opened(figure)

@@ -196,6 +196,7 @@ def test_a_calibration_made_elsewhere() -> None:
     assert missing_facts(texts(sections[1]), "elsewhere") == []
 
 
+@pytest.mark.slow
 def test_how_good_a_calibration_is() -> None:
     verdict = Verdict.of(
         [

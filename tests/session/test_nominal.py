@@ -35,6 +35,7 @@ def test_every_format_gives_the_same_closed_mesh(tmp_path: Path) -> None:
         assert missing_facts(found.text(), name, "320 triangles", "closed") == []
 
 
+@pytest.mark.slow
 @pytest.mark.process
 def test_step_and_3mf_state_their_units(tmp_path: Path) -> None:
     plate = read_nominal(PLATE)  # 60 x 40 x 8 mm with a bore of radius 12, and a pin of radius 5 and height 6

@@ -46,6 +46,7 @@ def test_a_wall_of_a_groove_receives_what_the_formula_of_two_strips_says():
     assert factors[away] == pytest.approx(expected[away], abs=0.01)
 
 
+@pytest.mark.slow
 def test_every_point_of_a_sphere_receives_the_same_light_from_each_part_of_it():
     scene = bowl(Pose(np.eye(3), np.array([0, 0, 640.0])), 60, 60)
     total = scene._form_factors.sum(axis=1)  # the cap's area over the sphere's: (1 - cos 60) / 2
@@ -53,6 +54,7 @@ def test_every_point_of_a_sphere_receives_the_same_light_from_each_part_of_it():
     assert total[inner] == pytest.approx(0.25, abs=0.015)
 
 
+@pytest.mark.slow
 def test_indirect_light_adds_up_and_needs_bounces():
     once, twice = (groove(POSE, indirect=Indirect(n)).light_matrix(RIG, "x") for n in (1, 2))
     assert np.all(once >= 0) and 1.02 < twice.sum() / once.sum() < 1.5
@@ -61,12 +63,14 @@ def test_indirect_light_adds_up_and_needs_bounces():
     assert 0.5 < glossy.sum() / once.sum() < 2 and abs(glossy - once).max() > 0.2 * once.max()
 
 
+@pytest.mark.slow
 def test_scattered_light_keeps_its_amount_away_from_the_border():
     scene = wax(POSE, indirect=Indirect(0, scattered=0.6, reach_mm=3.0))
     inner = np.abs(scene.vertices[:, :2]).max(axis=1) < 25
     assert scene._scattering.sum(axis=1)[inner] == pytest.approx(1.0, abs=0.1)
 
 
+@pytest.mark.slow
 def test_fine_stripes_average_in_the_light_of_other_surfaces():
     matrix = groove(POSE).light_matrix(RIG, "x")
     columns = np.arange(matrix.shape[1])
@@ -77,6 +81,7 @@ def test_fine_stripes_average_in_the_light_of_other_surfaces():
     assert depth[12.0] < 0.1 and depth[400.0] > 0.4
 
 
+@pytest.mark.slow
 def test_micro_phase_shifting_measures_a_groove_that_misleads_gray_code():
     misled, _ = coordinate_errors(p18)
     fine, sigma = coordinate_errors(micro)

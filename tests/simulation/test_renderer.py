@@ -137,6 +137,7 @@ def test_defocus_takes_modulation_and_leaves_phase():
     assert soft_B / sharp == pytest.approx(np.exp(-2 * (np.pi / 18) ** 2 * (sigma[1] ** 2 - sigma[0] ** 2)), rel=0.03)
 
 
+@pytest.mark.slow
 def test_gamma_bends_the_fringes_and_flicker_shakes_them():
     scene = blank_board(FACING, (400, 300))
     straight, bent = (shift(Renderer(letter(0.25, gamma=g), scene).capture(PHASE_X))[1].mean() for g in (1.0, 2.2))

@@ -48,6 +48,7 @@ def test_scans_all_around_close(points: PointSet, closed: BuiltMesh) -> None:
     assert closed.to_json()["watertight"] is True
 
 
+@pytest.mark.slow
 def test_what_no_scan_saw_stays_open_or_is_closed_as_asked(open_points: PointSet) -> None:
     plain = build_mesh(open_points)
     assert len(plain.topology.openings_mm) == 1 and not plain.topology.watertight

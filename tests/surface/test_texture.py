@@ -58,6 +58,7 @@ def shown(textured: TexturedMesh) -> np.ndarray:
     return textured.image[at][:, 0].astype(float)
 
 
+@pytest.mark.slow
 def test_the_texture_is_the_reflectance_without_shading_and_exposures(textured: TexturedMesh) -> None:
     red, truth = shown(textured), albedo(textured.mesh.vertices)
     away_from_step = np.abs(textured.mesh.vertices[:, 2]) > 3
@@ -92,6 +93,7 @@ def test_trimesh_and_open3d_read_mesh_and_image(textured: TexturedMesh, tmp_path
         assert {each.name for each in tmp_path.iterdir()} == {"part.obj", "part.mtl", "part.png"}
 
 
+@pytest.mark.slow
 def test_what_stands_in_the_way_leaves_no_trace() -> None:
     """A view that sees another surface at a place does not colour it."""
     scan = painted("front", 1.0)

@@ -63,6 +63,7 @@ def session_of(snapshot: Snapshot) -> SessionView:
     return snapshot.session
 
 
+@pytest.mark.slow
 def test_the_flight_from_recorded_poses_reaches_a_merged_ply(operator: Operator, acts: list[str]) -> None:
     assert_all_is_measured(operator.snapshot(), acts)
     assert "Capturing pose 7 of 8" not in acts

@@ -133,6 +133,7 @@ def test_stopping_frees_the_devices_and_starting_again_goes_on(wizard: Wizard) -
     until(lambda: "slviewer live" not in {thread.name for thread in threading.enumerate()})
 
 
+@pytest.mark.slow
 def test_a_fault_ends_it_with_a_sentence_and_what_was_kept_stays(wizard: Wizard) -> None:
     operator = wizard.operator
     assert operator.start_live()

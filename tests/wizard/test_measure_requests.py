@@ -137,6 +137,7 @@ def test_a_surface_of_what_has_changed_is_not_measured(operator: Operator) -> No
     assert surfaces.load(store, "balls").organised
 
 
+@pytest.mark.slow
 def test_a_nominal_model_is_looked_at_kept_and_compared_with(operator: Operator, tmp_path: Path) -> None:
     content = asset("objects/ammonite.ply").read_bytes()
     assert operator.upload_nominal("../My ammonite.ply", content)

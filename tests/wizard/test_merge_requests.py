@@ -102,6 +102,7 @@ def test_three_scans_close_a_loop_and_say_how_sure_they_are(operator: Operator) 
     assert not [notice for notice in snapshot.notices if notice.level == "error"]
 
 
+@pytest.mark.slow
 def test_a_turntable_is_told_by_its_angle_and_a_wrong_one_is_refused_until_the_next_try(operator: Operator) -> None:
     before = settled(operator)[1]
     assert operator.merge(NAMES[:2], "first", start="turntable", angle=40.0)
@@ -115,6 +116,7 @@ def test_a_turntable_is_told_by_its_angle_and_a_wrong_one_is_refused_until_the_n
     assert off_mm(merge, "second") < 0.1
 
 
+@pytest.mark.slow
 def test_picked_pairs_start_a_merge(operator: Operator) -> None:
     assert operator.reconstruct("third") and operator.session is not None
     operator.wait_until_idle(HANG_S)

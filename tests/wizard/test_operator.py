@@ -151,6 +151,7 @@ operator.wait_until_idle()
         assert set(states(operator.wait_until_idle()).values()) == {"good"}
 
 
+@pytest.mark.slow
 def test_hands_free_captures_a_board_that_is_held_still_once(tmp_path: Path) -> None:
     timing = replace(SPARING, previews_per_s=10.0, hold_s=0.2, count_s=0.3)
     previews: list[PreviewView] = []
@@ -192,6 +193,7 @@ def test_a_session_is_opened_for_one_operator_and_changed_for_another(operator: 
     assert not operator.calibrate() and not operator.undo_merge() and not operator.verify(["x"], "plane")
 
 
+@pytest.mark.slow
 def test_a_deleted_pose_can_be_brought_back(operator: Operator) -> None:
     operator.capture_pose()
     operator.wait_until_idle()

@@ -51,6 +51,7 @@ def test_an_environment_variable_switches_it_off(done: Path, monkeypatch: pytest
     assert not done.exists()
 
 
+@pytest.mark.slow
 @pytest.mark.process
 def test_the_process_ends_with_the_program_that_started_it() -> None:
     process = subprocess.Popen(preparation.COMMAND, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)

@@ -56,6 +56,7 @@ def test_poses_in_several_exposures_are_judged_as_others_are(operator: Operator)
     assert operator.session.load_capture("pose_02").exposures_ms == ()
 
 
+@pytest.mark.slow
 def test_a_suggested_exposure_is_set_and_can_be_undone(operator: Operator) -> None:
     assert operator.set_exposure(20.0) and operator.set_exposures((20.0, 90.0))  # far too bright
     assert operator.undo_exposure() is False and lacks(operator, "exposure") == []

@@ -59,6 +59,7 @@ def test_one_request_ends_in_a_watertight_mesh(operator: Operator) -> None:
     assert any(not missing_facts(text, "watertight") for text in list_texts(done, "good")), done.notices
 
 
+@pytest.mark.slow
 def test_a_turn_that_fails_or_is_cancelled_is_resumed(operator: Operator, rigs: FaultyRigs) -> None:
     rigs.faults.plan("turntable", 240)
     assert operator.scan_all_round(3, then_merge=False)
