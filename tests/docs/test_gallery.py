@@ -83,7 +83,8 @@ def test_the_notebook_of_a_live_cloud_runs_on_a_simulated_session(
     simulate = simulation.simulate
     monkeypatch.setattr(simulation, "simulate", copy_recorded)
     figures.run_notebook(EXAMPLES / "live_cloud.ipynb", tmp_path)
-    counts = capsys.readouterr().out.splitlines()[-1].strip("[]").split(", ")
+    printed = capsys.readouterr().out.splitlines()
+    counts = next(line for line in reversed(printed) if line.startswith("[")).strip("[]").split(", ")
     assert len(counts) == 3 and all(int(count) > 5000 for count in counts)
 
 
