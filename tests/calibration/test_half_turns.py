@@ -66,6 +66,7 @@ def test_turned_poses_are_found_and_change_nothing(seen, mixed, true) -> None:
     assert again.half_turned_poses == found.bundle.half_turned_poses
 
 
+@pytest.mark.slow
 def test_marked_poses_are_never_turned(mixed, true) -> None:
     marked = [replace(each, marked=i in TURNED) for i, each in enumerate(mixed)]
     found = adjust_bundle(marked, calibrate_stereo(marked, true.projector.size, str(BOARD)), cells_across=CELLS)

@@ -21,8 +21,6 @@ from slviewer.pipeline import simulate as simulation
 EXAMPLES = Path(__file__).parents[2] / "docs" / "examples"
 SCRIPTS = ("compare_models.py", "decode_and_look.py", "merge_and_mesh.py", "sphere_diameter.py")
 """Those that take a picture's path and run in this process; tests/test_public_api.py runs the others."""
-BY_DEFAULT = "decode_and_look.py"
-"""The others calibrate all models, or simulate sessions of their own."""
 
 pytestmark = pytest.mark.computes
 
@@ -35,10 +33,8 @@ def plots_without_screen() -> Iterator[None]:
     plt.close("all")
 
 
-@pytest.mark.parametrize(
-    "script",
-    [pytest.param(name, marks=() if name == BY_DEFAULT else pytest.mark.slow) for name in SCRIPTS],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("script", SCRIPTS)
 def test_an_example_draws_its_picture(script: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     picture = tmp_path / "picture.png"
     monkeypatch.setattr(sys, "argv", [script, str(picture)])

@@ -386,6 +386,7 @@ def test_rejected_calibration_states_reason_and_blocks_scans_until_accepted(
     assert errors == []
 
 
+@pytest.mark.slow
 def test_no_label_is_cut_at_1280_by_800(measured: tuple[Page, Operator, list[str]]) -> None:
     page, operator, _ = measured
     assert page.viewport_size == SIZE

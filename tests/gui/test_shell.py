@@ -81,6 +81,7 @@ def test_refused_rig_leaves_the_one_in_use(opened: Opened, app: App, tmp_path: P
     assert operator.snapshot().rig.state == "open"
 
 
+@pytest.mark.slow
 def test_camera_password_is_sent_to_operators_only(
     opened: Opened, shared_guest: Opened, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -129,6 +129,7 @@ def test_a_replacement_is_the_old_or_the_new(tmp_path, sequence, new, fault):
         assert whole_captures(folder) == {"pose_1": "new", "pose_2": "old"}
 
 
+@pytest.mark.slow
 @pytest.mark.computes
 @pytest.mark.parametrize("fault", ["kill", "disk full"])
 def test_an_import_that_was_interrupted_continues(tmp_path, fault):
