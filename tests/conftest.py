@@ -27,8 +27,8 @@ os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 NEEDS = ("browser", "process", "computes", "slow")
 """What a test may need; one that needs none of these is quick."""
-MAX_QUICK_COMPILE_S = 3.0
-"""Processor seconds that a quick test may spend in the compiler of kernels."""
+MAX_QUICK_COMPILE_S = 10.0
+"""Processor seconds that a quick test may spend compiling kernels, on a busy machine; 3 s on a quiet one."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

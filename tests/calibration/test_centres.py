@@ -69,6 +69,7 @@ def test_points_do_not_move_and_the_shift_grows_with_the_square_of_the_radius() 
         centroid_shifts(lens, T, TILTED.points, -1.0)
 
 
+@pytest.mark.computes
 @pytest.mark.parametrize(("towards", "psf_px"), [(0, 0.6), (90, 0.6), (135, 1.5)])
 def test_no_bias_is_left_on_a_board_turned_by_35_degrees(towards: float, psf_px: float) -> None:
     simulated, lens = noise_free(psf_px)

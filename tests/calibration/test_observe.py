@@ -19,6 +19,7 @@ def truth(u: float, v: float) -> float:
     return 300 + 0.6 * u - 0.1 * v + 8e-4 * u * v - 4e-4 * u**2
 
 
+@pytest.mark.computes
 def test_the_centre_is_read_from_the_ring_around_it() -> None:
     field, weight = field_with_a_dark_disc()
     value, slopes = fit_local_values(field, weight, np.array([[44.3, 39.6]]), np.array([25.0]))

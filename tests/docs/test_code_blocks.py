@@ -137,6 +137,7 @@ def test_the_commands_of_a_page_run(page: Path, workspace: Path, tmp_path: Path,
     run_blocks(page)
 
 
+@pytest.mark.computes
 @pytest.mark.parametrize("page", [p for p in pages_with("bash") if p.name in WITHOUT_SESSION], ids=name_of)
 def test_the_commands_of_a_page_without_a_session_run(page: Path, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
