@@ -21,7 +21,7 @@ from slviewer.devices.opencv_controls import (
     set_exposure,
     set_value,
 )
-from slviewer.devices.opencv_reader import OPENING_S, Reader
+from slviewer.devices.opencv_reader import TIMING, Reader, Timing
 from slviewer.devices.opencv_source import connect, describe_source, list_connected
 from slviewer.devices.opening import Openable
 from slviewer.devices.protocols import CameraSettings, Channel, check_frame, extract_channel
@@ -53,12 +53,13 @@ class OpenCVCamera(Openable):
         focus: float | None = None,
         white_balance: float | None = None,
         channel: Channel = "green",
+        timing: Timing = TIMING,
     ) -> None:
         """The webcam of that number, or the video at a path or an address.
 
         `size` is (width, height) px, which a webcam is switched to; without it, it is the one in use, or the source
         must answer now. The settings are made when it is opened, None leaves one as it is: exposure in ms, gain and
-        focus in the camera's own units, white balance in K.
+        focus in the camera's own units, white balance in K. `timing`: how long pictures are waited for.
 
         Raises InputError for invalid options, DeviceError for a source that does not answer.
         """
@@ -75,7 +76,7 @@ class OpenCVCamera(Openable):
         super().__init__(describe_source(source))
         known = _IN_USE.get(source)
         wanted = (size[0], size[1]) if size is not None else known.size if known is not None else None
-        self._source, self._connect = source, partial(connect, source, wanted)
+        self._source, self._connect, self._timing = source, partial(connect, source, wanted, timing), timing
         self._exposure_ms = CameraSettings(exposure_ms).exposure_ms
         self._gain, self._focus, self._white_balance = gain, focus, white_balance
         self._channel = channel
@@ -96,8 +97,8 @@ class OpenCVCamera(Openable):
         super().open()
         try:
             if self._reader is not None:
-                self._reader.join(OPENING_S)  # it may hang in a call, the device still in its hands
-            self._reader = Reader(self.name, self._connect)
+                self._reader.join(self._timing.opening_s)  # it may hang in a call, the device still in its hands
+            self._reader = Reader(self.name, self._connect, self._timing)
             self._next, self._read = self._check_size(self._reader.first()), 0
             self._notices = {}
             self._reader.do(self._prepare)
@@ -202,7 +203,7 @@ class OpenCVCamera(Openable):
 
     def _probe_size(self) -> tuple[int, int]:
         """Return the source's default size (width, height) px."""
-        reader = Reader(self.name, self._connect)
+        reader = Reader(self.name, self._connect, self._timing)
         try:
             height, width = reader.first().shape[:2]
             return width, height

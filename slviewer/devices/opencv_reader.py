@@ -1,8 +1,8 @@
 """One video capture on a thread of its own, which alone knows which of its pictures are new.
 
 Calls into a capture may block for as long as a driver or a network likes, so that callers who need a picture wait here,
-and not longer than `PATIENCE_S`. A live source is read without a break, wanted or not: unread pictures accumulate in
-the buffers of the driver, of the network and of the sender, and arrive later as if they were new.
+and not longer than `Timing.patience_s`. A live source is read without a break, wanted or not: unread pictures
+accumulate in the buffers of the driver, of the network and of the sender, and arrive later as if they were new.
 """
 
 import threading
@@ -17,23 +17,35 @@ import numpy as np
 
 from slviewer.errors import DeviceError
 
-PATIENCE_S = 2.5
-"""Without a picture for so long, a source is lost."""
-
-OPENING_S = 6.0
-"""A webcam's driver may take seconds to start it."""
-
 FRAMES = 3
 """The exposure of the first picture that arrives after a request started before it. So may the second have been, by a
 sensor that exposes its next picture while it reads out the previous one; that of the third started after it.
 """
 
-_WARM_UP_S = 0.5
-_ENDED_S = 0.5
 _WINDOW_S = 4.0
 _SATURATED = 0.95
 
 T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Timing:
+    """How long a reader waits, in s of `clock`.
+
+    `patience_s`: without a picture for so long, a source is lost. `opening_s`: a webcam's driver may take seconds to
+    start it. `warm_up_s`: a live source's first pictures, which may be dark, are discarded for so long. `ended_s`: a
+    source that refuses its next picture for so long gives no more.
+    """
+
+    patience_s: float = 2.5
+    opening_s: float = 6.0
+    warm_up_s: float = 0.5
+    ended_s: float = 0.5
+    clock: Callable[[], float] = time.monotonic
+
+
+TIMING = Timing()
+"""For real sources."""
 
 
 @dataclass(frozen=True)
@@ -115,13 +127,13 @@ class Reader:
     `connect` may raise DeviceError. So does every method once the source is lost: make another reader then.
     """
 
-    def __init__(self, name: str, connect: Callable[[], Connected]) -> None:
-        self._name, self._connect = name, connect
+    def __init__(self, name: str, connect: Callable[[], Connected], timing: Timing = TIMING) -> None:
+        self._name, self._connect, self._timing = name, connect, timing
         self._condition = threading.Condition()
         self._jobs: deque[_Job] = deque()
         self._wanted: _Wanted | None = None
         self._first: np.ndarray | None = None
-        self._arrived = time.monotonic()
+        self._arrived = timing.clock()
         self._lost = ""
         self._closing = False
         self._live = False
@@ -137,7 +149,7 @@ class Reader:
     def first(self) -> np.ndarray:
         """Wait for the first valid picture, (h, w, 3) BGR or (h, w), once the source is open. Raises DeviceError."""
         with self._condition:
-            self._wait_until(lambda: self._first is not None, OPENING_S)
+            self._wait_until(lambda: self._first is not None, self._timing.opening_s)
             assert self._first is not None
             return self._first
 
@@ -147,7 +159,7 @@ class Reader:
         with self._condition:
             self._jobs.append(job)
             self._condition.notify_all()
-            self._wait_until(lambda: job.done, PATIENCE_S)
+            self._wait_until(lambda: job.done, self._timing.patience_s)
         return job.result()
 
     def picture(self, later: int = 0) -> np.ndarray:
@@ -155,12 +167,12 @@ class Reader:
 
         The delay within an encoder and a network cannot be measured here: the rig measures it and waits for it.
         """
-        wanted = _Wanted(FRAMES + later)
+        wanted, patience_s = _Wanted(FRAMES + later), self._timing.patience_s
         with self._condition:
             self._wanted = wanted
             try:
                 # some sources may be slow and others may come in clumps: the end is when nothing counts for too long
-                self._wait_until(lambda: wanted.image is not None, PATIENCE_S, PATIENCE_S * wanted.remaining)
+                self._wait_until(lambda: wanted.image is not None, patience_s, patience_s * wanted.remaining)
             finally:
                 self._wanted = None
         assert wanted.image is not None
@@ -179,11 +191,11 @@ class Reader:
 
     def _wait_until(self, ready: Callable[[], bool], patience_s: float, longest_s: float = 0.0) -> None:
         """Wait for `ready()` on the condition. Raises DeviceError once no picture has come for `patience_s`."""
-        requested_s = time.monotonic()
+        requested_s = self._timing.clock()
         while not ready():
             if self._lost:
                 raise DeviceError(self._lost)
-            now = time.monotonic()
+            now = self._timing.clock()
             silent = now - max(self._arrived, requested_s) if longest_s else now - requested_s
             if silent > patience_s:
                 raise DeviceError(
@@ -229,12 +241,13 @@ class Reader:
 
     def _read_first(self, connected: Connected) -> None:
         """Read the first valid picture; the earliest may be dark, or from buffers filled while opening."""
-        start_s = time.monotonic()
+        timing = self._timing
+        start_s = timing.clock()
         read, image = connected.capture.read()
         frames = 1
         while connected.live and not self._closing:
-            late = time.monotonic() - start_s
-            if (read and frames > 2 and late > _WARM_UP_S) or (not read and late > PATIENCE_S):
+            late = timing.clock() - start_s
+            if (read and frames > 2 and late > timing.warm_up_s) or (not read and late > timing.patience_s):
                 break
             if not read:
                 time.sleep(0.02)
@@ -246,7 +259,7 @@ class Reader:
                 "another size"
             )
         with self._condition:
-            self._first, self._live, self._arrived = image, connected.live, time.monotonic()
+            self._first, self._live, self._arrived = image, connected.live, timing.clock()
             self._condition.notify_all()
 
     def _read_next(self, connected: Connected) -> None:
@@ -256,9 +269,9 @@ class Reader:
             read = connected.capture.grab()
         else:
             read, image = connected.capture.read()
-        now = time.monotonic()
+        now = self._timing.clock()
         if not read:
-            if now - self._arrived > _ENDED_S:
+            if now - self._arrived > self._timing.ended_s:
                 raise DeviceError(f"{self._name} gives no more pictures: plug it in or start it again, and reconnect")
             time.sleep(0.01)
             return

@@ -8,7 +8,7 @@ from urllib.parse import urlsplit
 
 import cv2
 
-from slviewer.devices.opencv_reader import PATIENCE_S, Connected
+from slviewer.devices.opencv_reader import TIMING, Connected, Timing
 from slviewer.errors import DeviceError
 
 # named, as OpenCV's own choice differs between its builds, and with it the units of every control
@@ -29,14 +29,17 @@ def describe_source(source: int | str) -> str:
     return f"the camera {source}" if _is_device(source) else f"the video {Path(source).name}"
 
 
-def connect(source: int | str, size: tuple[int, int] | None) -> Connected:
-    """Open a source, a webcam at `size` (width, height) px where supported. Raises DeviceError."""
+def connect(source: int | str, size: tuple[int, int] | None, timing: Timing = TIMING) -> Connected:
+    """Open a source, a webcam at `size` (width, height) px where supported. Raises DeviceError.
+
+    An address may take `patience_s` of the timing to answer, and later to send more.
+    """
     _silence_libraries()
     if isinstance(source, int) or _is_device(source):
         return _open_webcam(source, size)
     name = describe_source(source)
     if _is_address(source):
-        limit = int(1000 * PATIENCE_S)
+        limit = int(1000 * timing.patience_s)
         # one thread: a decoder that works on several pictures at once keeps as many of them back. A stream that changes
         # its size is scaled to the previous one, without notice
         options = {

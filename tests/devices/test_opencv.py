@@ -18,6 +18,7 @@ from mjpeg import NetworkCamera, network_camera
 from slviewer.devices.capture import capture_with_texture
 from slviewer.devices.drivers import driver
 from slviewer.devices.opencv import OpenCVCamera
+from slviewer.devices.opencv_reader import Timing
 from slviewer.devices.opencv_source import list_sysfs_webcams
 from slviewer.devices.opening import Openable
 from slviewer.devices.protocols import CameraSettings, ColourCamera, Rig, check_index, check_level
@@ -26,7 +27,22 @@ from slviewer.fringe.presets import gray
 from slviewer.fringe.sequence import PatternSequence
 
 SIZE = (160, 120)
-FPS = 30.0
+FPS = 60.0
+QUICK = Timing(warm_up_s=0.0, ended_s=0.05)
+"""These sources give no dark pictures, and one that has ended stays so."""
+
+
+class Hastened:
+    """The time, which passes by `step_s` more with each look."""
+
+    step_s = 0.0
+
+    def __init__(self) -> None:
+        self._skipped_s = 0.0
+
+    def __call__(self) -> float:
+        self._skipped_s += self.step_s
+        return time.monotonic() + self._skipped_s
 
 
 def wait_pictures(seen: NetworkCamera, count: int) -> None:
@@ -109,7 +125,7 @@ def test_each_channel_of_a_colour_video(tmp_path):
 def test_no_grab_returns_an_older_picture():
     rng = np.random.default_rng(1)
     passed = []  # pictures that were sent during a grab
-    with network_camera(coded(0), FPS) as seen, opened(OpenCVCamera(seen.url, SIZE)) as camera:
+    with network_camera(coded(0), FPS) as seen, opened(OpenCVCamera(seen.url, SIZE, timing=QUICK)) as camera:
         for k in range(1, 13):
             wait_pictures(seen, 24 if k == 8 else int(rng.integers(3)))  # for a while nobody asks
             seen.picture = coded(k)
@@ -121,7 +137,7 @@ def test_no_grab_returns_an_older_picture():
 
 def test_pictures_that_come_in_clumps_are_never_taken_for_new_ones():
     rng = np.random.default_rng(2)
-    with network_camera(coded(0), FPS, clump=3) as seen, opened(OpenCVCamera(seen.url, SIZE)) as camera:
+    with network_camera(coded(0), FPS, clump=3) as seen, opened(OpenCVCamera(seen.url, SIZE, timing=QUICK)) as camera:
         for k in range(1, 6):
             wait_pictures(seen, int(rng.integers(4)))
             seen.picture = coded(k)
@@ -151,7 +167,7 @@ class Painter(Openable):
 def test_every_frame_of_a_capture_is_of_its_pattern():
     sequence = gray(Painter.size)
     with network_camera(coded(255), FPS) as seen:
-        rig = Rig("painted", OpenCVCamera(seen.url, SIZE), Painter(seen))
+        rig = Rig("painted", OpenCVCamera(seen.url, SIZE, timing=QUICK), Painter(seen))
         with rig.opened():
             taken = capture_with_texture(rig, sequence)
             assert [number(frame) for frame in taken.frames] == list(range(len(sequence.frames)))
@@ -159,33 +175,38 @@ def test_every_frame_of_a_capture_is_of_its_pattern():
 
 
 def test_a_stream_says_that_its_settings_are_its_own():
-    with network_camera(coded(1)) as seen, opened(OpenCVCamera(seen.url, SIZE, exposure_ms=5.0)) as camera:
+    with (
+        network_camera(coded(1), FPS) as seen,
+        opened(OpenCVCamera(seen.url, SIZE, exposure_ms=5.0, timing=QUICK)) as camera,
+    ):
         (note,) = camera.notes
         assert "secret" not in note + camera.name and not missing_facts(camera.name, "127.0.0.1/video")
         assert not missing_facts(note, "exposure")
 
 
 def test_a_stream_that_stalls_is_told_and_comes_back():
-    with network_camera(coded(1), FPS) as seen, opened(OpenCVCamera(seen.url, SIZE)) as camera:
+    clock = Hastened()
+    timing = Timing(warm_up_s=0.0, clock=clock)
+    with network_camera(coded(1), FPS) as seen, opened(OpenCVCamera(seen.url, SIZE, timing=timing)) as camera:
         seen.going.clear()
-        asked = time.monotonic()
+        asked, clock.step_s = clock(), 1.0
         with raises(DeviceError, "127.0.0.1/video"):
             grabbed(camera)
-        assert 1.0 < time.monotonic() - asked < HANG_S
+        assert 1.0 < clock() - asked < HANG_S
         asked = time.monotonic()
         with pytest.raises(DeviceError):
             camera.settings() and grabbed(camera)
         camera.close()
         assert time.monotonic() - asked < HANG_S
         seen.going.set()
-        seen.picture = coded(7)
+        seen.picture, clock.step_s = coded(7), 0.0
         camera.open()
         assert number(grabbed(camera)) == 7
 
 
 def test_a_camera_that_is_gone_is_told_and_works_once_it_is_back():
     with network_camera(coded(1), FPS) as seen:
-        camera = OpenCVCamera(seen.url, SIZE)
+        camera = OpenCVCamera(seen.url, SIZE, timing=QUICK)
         camera.open()
         port = seen.port
     asked = time.monotonic()
@@ -202,8 +223,8 @@ def test_a_camera_that_is_gone_is_told_and_works_once_it_is_back():
 
 
 def test_another_size_is_told():
-    with network_camera(coded(1)) as seen, raises(DeviceError, "160 x 120", "320 x 240"):
-        OpenCVCamera(seen.url, (320, 240)).open()
+    with network_camera(coded(1), FPS) as seen, raises(DeviceError, "160 x 120", "320 x 240"):
+        OpenCVCamera(seen.url, (320, 240), timing=QUICK).open()
 
 
 # what does not answer
@@ -226,7 +247,7 @@ def test_what_does_not_answer_is_told_within_seconds_and_in_one_sentence(tmp_pat
         ):
             begun = time.monotonic()
             with raises(DeviceError, *facts):
-                OpenCVCamera(source)
+                OpenCVCamera(source, timing=Timing(patience_s=0.2))
             assert time.monotonic() - begun < HANG_S, source
     camera = OpenCVCamera("63", SIZE)  # with its size given, it may be plugged in later
     with raises(DeviceError, "camera 63"):
@@ -293,20 +314,20 @@ class _OneAtATime(NetworkCamera):
 def test_a_camera_in_use_is_chosen_once_more_and_taken_over():
     server = _OneAtATime(np.full(SIZE[::-1], 100, np.uint8), FPS)
     try:
-        first = OpenCVCamera(server.url)
+        first = OpenCVCamera(server.url, timing=QUICK)
         assert until(lambda: not server.busy)
         with opened(first):
-            second = OpenCVCamera(server.url)
+            second = OpenCVCamera(server.url, timing=QUICK)
             assert second.size == SIZE
             with pytest.raises(DeviceError):
                 second.open()
-            assert OpenCVCamera(server.url).size == SIZE  # the first one has it still
+            assert OpenCVCamera(server.url, timing=QUICK).size == SIZE  # the first one has it still
         assert until(lambda: not server.busy)
         with opened(second):
             assert abs(int(grabbed(second).mean()) - 100) < 5
         server.die()
         with pytest.raises(DeviceError):
-            OpenCVCamera(server.url)
+            OpenCVCamera(server.url, timing=QUICK)
     finally:
         if not server.dead:
             server.die()

@@ -12,11 +12,14 @@ from mjpeg import network_camera
 from slviewer.devices import opencv as opencv_module
 from slviewer.devices.opencv import OpenCVCamera
 from slviewer.devices.opencv_controls import dialect_of, disable_automatics, exposure_ms, set_exposure
-from slviewer.devices.opencv_reader import Connected, Pace
+from slviewer.devices.opencv_reader import Connected, Pace, Timing
 from slviewer.devices.opencv_source import connect
 from slviewer.devices.protocols import CameraSettings
 
 SIZE = (160, 120)
+FPS = 200.0
+"""Of a picture that does not change."""
+QUICK = Timing(warm_up_s=0.0)
 
 
 class Webcam:
@@ -88,10 +91,10 @@ def test_windows_is_told_the_values_it_has_so_that_they_stay():
 @pytest.fixture
 def plugged(monkeypatch):
     """`plugged(controls, stubborn)`: what opens next is such a webcam."""
-    with network_camera(np.full((120, 160), 90, np.uint8)) as seen:
+    with network_camera(np.full((120, 160), 90, np.uint8), FPS) as seen:
 
         def plug(controls, stubborn=()):
-            def instead(source, size):
+            def instead(source, size, timing):
                 return Connected(Webcam(connect(seen.url, None).capture, "V4L2", controls, stubborn), live=True)
 
             monkeypatch.setattr(opencv_module, "connect", instead)
@@ -102,7 +105,7 @@ def plugged(monkeypatch):
 def test_a_webcam_is_set_and_read_back_and_its_automatics_are_switched_off(plugged):
     controls = dict(V4L2)
     plugged(controls)
-    camera = OpenCVCamera(0, SIZE, exposure_ms=20.0, gain=32, focus=40)
+    camera = OpenCVCamera(0, SIZE, exposure_ms=20.0, gain=32, focus=40, timing=QUICK)
     camera.open()
     try:
         assert camera.notes == () and camera.settings() == CameraSettings(20.0)
@@ -130,7 +133,7 @@ def test_a_webcam_is_set_and_read_back_and_its_automatics_are_switched_off(plugg
 
 def test_what_a_webcam_ignores_is_said(plugged):
     plugged(dict(V4L2), stubborn=(cv2.CAP_PROP_AUTO_EXPOSURE, cv2.CAP_PROP_FOCUS, cv2.CAP_PROP_EXPOSURE))
-    camera = OpenCVCamera(0, SIZE, exposure_ms=5.0, focus=40, white_balance=4600)
+    camera = OpenCVCamera(0, SIZE, exposure_ms=5.0, focus=40, white_balance=4600, timing=QUICK)
     camera.open()
     try:
         said = "; ".join(camera.notes)
@@ -142,7 +145,7 @@ def test_what_a_webcam_ignores_is_said(plugged):
 
 
 def test_a_camera_without_colour_is_read_as_it_is(monkeypatch):
-    with network_camera(np.full((120, 160), 90, np.uint8)) as seen:
+    with network_camera(np.full((120, 160), 90, np.uint8), FPS) as seen:
 
         class Grey(Webcam):
             def retrieve(self):
@@ -152,7 +155,7 @@ def test_a_camera_without_colour_is_read_as_it_is(monkeypatch):
         monkeypatch.setattr(
             opencv_module, "connect", lambda *_: Connected(Grey(connect(seen.url, None).capture, "V4L2", {}), live=True)
         )
-        camera = OpenCVCamera(0, SIZE)
+        camera = OpenCVCamera(0, SIZE, timing=QUICK)
         camera.open()
         try:
             out = np.zeros((120, 160), np.uint8)
