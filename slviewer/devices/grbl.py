@@ -7,6 +7,7 @@ An alarm is never unlocked by itself: only who looks at the table knows that it 
 import re
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 import msgspec
@@ -24,8 +25,6 @@ BOOT_S = 6.0
 REPLY_S = 5.0
 """How long a command may take to be accepted."""
 _ANSWER_S = 1.0  # to a question while it boots
-_POLL_S = 0.1
-_QUIET_S = 0.2
 _STOP_S = 2.0
 _TOLERANCE_DEG = 0.1
 _SPARE_S = 10.0  # that a motion may take longer than planned, beside twice the plan
@@ -74,6 +73,21 @@ _BLOCKED = {
 """States of GRBL in which it does not turn."""
 
 
+@dataclass(frozen=True)
+class Timing:
+    """How a controller is waited for: how often it is asked for its state, how long it must be silent until everything
+    that it had to say has been read, in s, and the clock.
+    """
+
+    poll_s: float = 0.1
+    quiet_s: float = 0.2
+    clock: Callable[[], float] = time.monotonic
+
+
+TIMING = Timing()
+"""For real controllers."""
+
+
 class GcodeTurntable(Openable):
     """A turntable on one axis of a GRBL or Marlin controller. It is open while its serial port is."""
 
@@ -91,14 +105,14 @@ class GcodeTurntable(Openable):
         limits_deg: Sequence[float] | None = None,
         boot_s: Positive = BOOT_S,
         reply_s: Positive = REPLY_S,
-        clock: Callable[[], float] = time.monotonic,
+        timing: Timing = TIMING,
     ) -> None:
         """The controller at a serial port, such as /dev/ttyUSB0 or COM3.
 
         `degrees_per_unit`: degrees that the table turns for one unit (mm) of the axis, 1 where the controller's steps
         per mm were set to steps per degree; negative to reverse it. `settle_ms` passes after it stands still.
-        `boot_s`, `reply_s`: how long it may take to start, and to accept a command, in seconds of `clock`. Raises
-        InputError.
+        `boot_s`, `reply_s`: how long it may take to start, and to accept a command, in seconds of the clock of
+        `timing`. Raises InputError.
         """
         if degrees_per_unit == 0:
             raise InputError("degrees_per_unit = 0 turns nothing: give the degrees per unit of the axis")
@@ -108,7 +122,8 @@ class GcodeTurntable(Openable):
         self.limits_deg = None if limits_deg is None else (float(limits_deg[0]), float(limits_deg[1]))
         self._port, self._baud, self._dialect, self._axis = port, baud, dialect, axis
         self._degrees_per_unit, self._speed_deg_s, self._settle_ms = degrees_per_unit, speed_deg_s, settle_ms
-        self._boot_s, self._reply_s, self._clock = boot_s, reply_s, clock
+        self._boot_s, self._reply_s = boot_s, reply_s
+        self._timing, self._clock = timing, timing.clock
         self._serial: Any = None
         self._buffer = b""
         self._unreadable = 0  # bytes that are no text, since it was opened
@@ -122,7 +137,11 @@ class GcodeTurntable(Openable):
         try:
             try:
                 self._serial = serial.Serial(
-                    self._port, self._baud, timeout=0.05, write_timeout=self._reply_s, exclusive=True
+                    self._port,
+                    self._baud,
+                    timeout=self._timing.poll_s / 2,
+                    write_timeout=self._reply_s,
+                    exclusive=True,
                 )
             except (OSError, ValueError) as error:
                 raise TurntableError(
@@ -174,7 +193,7 @@ class GcodeTurntable(Openable):
                     check()
                     if self._clock() > end:
                         raise TurntableError(f"{self.name} did not reach {deg:g} degrees in time: {_CHECK_TABLE}")
-                    time.sleep(_POLL_S)
+                    time.sleep(self._timing.poll_s)
             reached_deg = self.position_deg()
             if abs(reached_deg - deg) > max(_TOLERANCE_DEG, 0.01 * abs(self._degrees_per_unit)):
                 raise TurntableError(
@@ -211,7 +230,7 @@ class GcodeTurntable(Openable):
 
     def _drain(self) -> None:
         """Discard lines until none comes: late answers to earlier questions must not confirm a command."""
-        while self._read_line(self._clock() + _QUIET_S) is not None:
+        while self._read_line(self._clock() + self._timing.quiet_s) is not None:
             pass
 
     def _command(self, command: str, end: float | None = None, check: Callable[[], None] = lambda: None) -> None:
@@ -220,7 +239,7 @@ class GcodeTurntable(Openable):
         end = self._clock() + self._reply_s if end is None else end
         while self._clock() < end:
             check()
-            line = self._read_line(min(end, self._clock() + _POLL_S))
+            line = self._read_line(min(end, self._clock() + self._timing.poll_s))
             if line is None:
                 continue
             self._check_line(line, command)
@@ -290,7 +309,7 @@ class GcodeTurntable(Openable):
             self._write(b"M410\n" if self._is_marlin else b"\x85")
             end = self._clock() + _STOP_S
             while not self._is_marlin and self._clock() < end and self._read_grbl()[0] != "Idle":
-                time.sleep(_POLL_S)
+                time.sleep(self._timing.poll_s)
             self._drain()
         except TurntableError:  # what made it stop is reported
             return

@@ -29,6 +29,9 @@ Fault = Literal[
 ]
 """What happens at the next motion; the last ones but "stops" from the start."""
 
+HALFWAY = ("alarm", "stuck", "unplugged", "reset", "stops")
+"""Faults that end a motion when half of the way is done, however late this program looks."""
+
 BANNER = b"\r\nGrbl 1.1h ['$' for help]\r\n"
 
 
@@ -91,12 +94,12 @@ class Controller:
                 else:  # the first question is lost
                     booted = True
                     self._send(BANNER if self.dialect == "grbl" else b"start\n")
-                    self._is_waited_for_in_vain = True
+                    self._skip_once_read_s = 15.0  # the driver asks again
             if self._skip_once_read_s and self._is_read():
                 self.skip(self._skip_once_read_s)
                 self._skip_once_read_s = 0.0
-            if (self.fault == "other baud" or self._is_waited_for_in_vain) and self._is_read():
-                self.skip(1.0)
+            if self._is_waited_for_in_vain and self._is_read():
+                self.skip(20.0)
             self._move()
 
     def _is_read(self) -> bool:
@@ -126,6 +129,7 @@ class Controller:
     def _handle(self, line: str) -> None:
         if self.fault == "other baud":
             self._send(b"\xf8\x80\xfe\n")
+            self._is_waited_for_in_vain = True
         elif self.dialect == "grbl":
             self._handle_grbl(line)
         else:
@@ -187,7 +191,7 @@ class Controller:
     def _move(self) -> None:
         if self.is_moving:
             share = min(1.0, (time.monotonic() - self._begun) / max(self._duration, 1e-6))
-            if self.fault == "stuck":
+            if self.fault in HALFWAY:
                 share = min(share, 0.5)
             self.position = self._begin + share * (self._target - self._begin)
             if share >= 0.5:

@@ -9,7 +9,7 @@ from facts import missing_facts, raises
 from gcode_controller import Controller, Fault
 
 from slviewer.devices.browser import PageChannels
-from slviewer.devices.grbl import ALARMS, ERRORS, GcodeTurntable
+from slviewer.devices.grbl import ALARMS, ERRORS, GcodeTurntable, Timing
 from slviewer.devices.protocols import Turntable
 from slviewer.devices.simulated import SimulatedTurntable
 from slviewer.devices.world import SimulatedWorld
@@ -20,7 +20,12 @@ from slviewer.pipeline.turn import place_object
 from slviewer.preflight.turntable import check_turntable
 from slviewer.simulation.rig import letter
 
-FAST: dict[str, Any] = {"speed_deg_s": 600.0, "settle_ms": 0.0, "boot_s": 60.0, "reply_s": 60.0}
+FAST: dict[str, Any] = {"speed_deg_s": 6000.0, "settle_ms": 0.0, "boot_s": 60.0, "reply_s": 60.0}
+
+
+def timing(controller: Controller) -> Timing:
+    """Waits for a controller that answers each line at once, in its own time."""
+    return Timing(poll_s=0.01, quiet_s=0.05, clock=controller.clock)
 
 
 @pytest.fixture(params=["simulated", "grbl", "marlin"])
@@ -42,7 +47,7 @@ def make_table(controller: Controller | None, **options: Any) -> Turntable:
     if controller is None:
         return SimulatedTurntable(SimulatedWorld(letter(0.05)))
     return GcodeTurntable(
-        controller.port, degrees_per_unit=2.0, limits_deg=[-1000, 1000], clock=controller.clock, **(FAST | options)
+        controller.port, degrees_per_unit=2.0, limits_deg=[-1000, 1000], timing=timing(controller), **(FAST | options)
     )
 
 
@@ -94,7 +99,7 @@ def test_a_cancelled_motion_stops(controller: Controller | None) -> None:
 def broken(dialect: Any, fault: Fault) -> str:
     """The message of a fault in the middle of a turn of 60 degrees."""
     with Controller(dialect) as controller:
-        table = GcodeTurntable(controller.port, clock=controller.clock, **FAST)
+        table = GcodeTurntable(controller.port, timing=timing(controller), **FAST)
         table.open()
         controller.fault = fault
 
@@ -149,7 +154,7 @@ def test_a_fault_of_marlin_is_named(fault: Fault, facts: tuple[str, ...]) -> Non
 @pytest.mark.parametrize("fault", ["garbage", "slow"])
 def test_noise_and_slowness_are_no_faults(dialect: Any, fault: Fault) -> None:
     with Controller(dialect) as controller:
-        table = GcodeTurntable(controller.port, clock=controller.clock, **FAST)
+        table = GcodeTurntable(controller.port, timing=timing(controller), **FAST)
         table.open()
         controller.fault = fault
         table.turn_to(60.0)
@@ -172,7 +177,7 @@ def test_a_controller_that_cannot_turn_is_not_opened(fault: Fault, facts: tuple[
         if fault == "silent":
             controller.dialect, dialect = "marlin", "grbl"
             facts = ("grbl", "dialect", "60 s")
-        table = GcodeTurntable(controller.port, dialect=dialect, clock=controller.clock, **FAST)
+        table = GcodeTurntable(controller.port, dialect=dialect, timing=timing(controller), **FAST)
         with raises(TurntableError, *facts):
             table.open()
         with raises(DeviceError, "not open"):
@@ -184,7 +189,7 @@ def test_a_controller_that_cannot_turn_is_not_opened(fault: Fault, facts: tuple[
 @pytest.mark.parametrize("dialect", ["grbl", "marlin"])
 def test_a_controller_that_restarts_when_its_port_is_opened_is_waited_for(dialect: Any) -> None:
     with Controller(dialect, "boots") as controller:
-        table = GcodeTurntable(controller.port, clock=controller.clock, **FAST)
+        table = GcodeTurntable(controller.port, timing=timing(controller), **FAST)
         table.open()
         table.turn_to(10.0)
         assert table.position_deg() == pytest.approx(10.0, abs=0.01)
@@ -213,7 +218,7 @@ def test_every_alarm_and_error_has_a_remedy() -> None:
         ({"driver": "grbl", "port": "COM3", "bauds": 1}, "bauds"),
         ({"driver": "simulated", "repeatability_deg": 99.0}, "repeatability_deg"),
         ({"driver": "opencv"}, "opencv"),
-        ({"driver": "grbl", "port": "COM3", "clock": 1}, "clock"),
+        ({"driver": "grbl", "port": "COM3", "timing": 1}, "timing"),
         ({"port": "COM3"}, "driver"),
         ("grbl", "turntable"),
     ],
