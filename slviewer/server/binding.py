@@ -12,14 +12,15 @@ RESOLVE_SECONDS = 1.5
 """A name server that does not answer must not keep the operator waiting."""
 
 
-def listen(host: str, port: int) -> Listener:
+def listen(host: str, port: int, resolve_s: float = RESOLVE_SECONDS) -> Listener:
     """A TCP socket listening at exactly this address, with limits for strangers; port 0 takes any free one.
 
-    Raises SlviewerError within two seconds where the port is in use or the address is not this machine's.
+    A name server has `resolve_s` to answer. Raises SlviewerError at the latest then, where the port is in use or the
+    address is not this machine's.
     """
     if not host or not 0 <= port <= 65535:
         raise SlviewerError(f"{host or 'An empty host'}:{port} is no address to serve at: try 127.0.0.1 and port 8080.")
-    family, address = _resolve(host, port)
+    family, address = _resolve(host, port, resolve_s)
     sock = Listener(family, socket.SOCK_STREAM)
     try:
         if os.name == "posix":  # elsewhere this option lets two programs share a port
@@ -43,7 +44,7 @@ def network_address() -> str | None:
         return str(sock.getsockname()[0])
 
 
-def _resolve(host: str, port: int) -> tuple[int, tuple]:
+def _resolve(host: str, port: int, resolve_s: float) -> tuple[int, tuple]:
     """Address family and socket address of host and port; raises SlviewerError if the name does not resolve in time."""
     candidates: list[tuple[int, tuple]] = []
 
@@ -57,7 +58,7 @@ def _resolve(host: str, port: int) -> tuple[int, tuple]:
 
     thread = threading.Thread(target=look_up, daemon=True)
     thread.start()
-    thread.join(RESOLVE_SECONDS)
+    thread.join(resolve_s)
     if not candidates:
         raise SlviewerError(
             f"No address was found for the host {host!r}: use 127.0.0.1 for this machine alone, "

@@ -16,7 +16,7 @@ from slviewer.errors import UsageError
 from slviewer.server import viser_internals
 from slviewer.server.access import Access, Role
 from slviewer.server.auth_middleware import AuthMiddleware, DevicePage
-from slviewer.server.binding import listen, network_address
+from slviewer.server.binding import RESOLVE_SECONDS, listen, network_address
 from slviewer.server.connection import REQUEST_SECONDS, STALL_SECONDS, Connection, quiet_logger
 from slviewer.server.credentials import Certificate, load_tokens, save_tokens, self_made_certificate
 from slviewer.server.downloads import Downloads
@@ -28,7 +28,7 @@ from slviewer.server.uploads import UploadBudget
 MESSAGE_LIMIT = 32 * 2**20
 """Bytes of one message from a browser; the largest is a picture that the server requested."""
 _NAME = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9_](?:[A-Za-z0-9._-]{0,251}[A-Za-z0-9_])?)(:[0-9]{1,5})?")
-_LEAVING_SECONDS = 3.0
+LEAVING_SECONDS = 3.0
 """How long a browser that requested new links may take to open its own."""
 
 
@@ -98,8 +98,9 @@ class SafeServer:
         """A link for the operator's browser that can be opened once, soon."""
         return f"{self.origin}/#{self.access.issue_one_time_token()}"
 
-    def renew_links(self, client_id: int) -> None:
-        """Replace all tokens, close all connections, and lead the operator's client that requested it to its new page.
+    def renew_links(self, client_id: int, leaving_s: float = LEAVING_SECONDS) -> None:
+        """Replace all tokens, close all connections, and lead the operator's client that requested it to its new page,
+        for which it has `leaving_s`.
 
         Raises OSError where the tokens come from a file that cannot be replaced; they are replaced here nevertheless.
         """
@@ -107,7 +108,7 @@ class SafeServer:
         self.access.renew()
         viser_internals.call_soon(self.viser, 0.0, self.admissions.close_all, leaving)
         viser_internals.navigate(self.viser, client_id, f"/#{self.access.issue_one_time_token()}")
-        viser_internals.call_soon(self.viser, _LEAVING_SECONDS, self.admissions.close_all, None, leaving)
+        viser_internals.call_soon(self.viser, leaving_s, self.admissions.close_all, None, leaving)
         if self.serving.token_file is not None:
             save_tokens(self.serving.token_file, {role: grant.token for role, grant in self.access.grants.items()})
 
@@ -153,12 +154,13 @@ def serve(
     upload_limit: int = 256 * 10**6,
     request_s: float = REQUEST_SECONDS,
     stall_s: float = STALL_SECONDS,
+    resolve_s: float = RESOLVE_SECONDS,
     connections: Mapping[Role, int] = CONNECTIONS,
 ) -> SafeServer:
     """Start the server of viser's page. `upload_limit` bounds the bytes of all unfinished uploads.
 
-    A browser has `request_s` to send its request, and the reader of a file `stall_s` to take some of it; `connections`
-    bounds the open ones by role.
+    A browser has `request_s` to send its request, the reader of a file `stall_s` to take some of it, and a name server
+    `resolve_s` to answer; `connections` bounds the open ones by role.
 
     Raises SlviewerError within two seconds where the address can't be served, where viser is not the pinned one, and
     where tokens or certificate cannot be used.
@@ -173,7 +175,7 @@ def serve(
     context = certificate.context() if certificate else None
     limit_log()
     raise_descriptor_limit()
-    sock = listen(serving.host, serving.port)
+    sock = listen(serving.host, serving.port, resolve_s)
     address, port = sock.getsockname()[:2]
     try:
         access = Access(port, tokens, serving.names, tls=certificate is not None)

@@ -11,6 +11,7 @@ import time
 import pytest
 from clocks import HANG_S, SteppingClock, until
 from facts import missing_facts, raises
+from playwright.sync_api import ViewportSize
 from server_client import Browser
 from websockets.exceptions import InvalidStatus
 
@@ -21,6 +22,8 @@ from slviewer.server.credentials import load_tokens
 from slviewer.server.secure import Serving, serve
 
 EVIL = "http://evil.example"
+SMALL: ViewportSize = {"width": 320, "height": 240}
+"""Of windows whose pictures nobody looks at."""
 
 
 @pytest.mark.parametrize("role", ROLES)
@@ -39,7 +42,7 @@ def test_a_link_is_exchanged_for_a_cookie_of_its_own_path(server, stranger, role
 
 
 def test_one_browser_holds_the_cookies_of_all_roles(browser, server):
-    context = browser.new_context()
+    context = browser.new_context(viewport=SMALL)
     operating, watching = context.new_page(), context.new_page()
     requests = []
     context.on("request", lambda request: requests.append(request))
@@ -58,7 +61,7 @@ def test_one_browser_holds_the_cookies_of_all_roles(browser, server):
     assert not [one for one in sent for grant in grants if grant.token in one]
     bare = context.new_page()  # the bare address leads on to where the last link led
     bare.goto(server.origin)
-    bare.wait_for_url("**/watch-*/")
+    bare.wait_for_url("**/watch-*/", wait_until="commit")
     context.close()
 
 
@@ -76,11 +79,11 @@ def test_another_server_of_this_machine_is_sent_no_cookie(browser, server):
 
     thief = http.server.HTTPServer(("127.0.0.1", 0), Thief)
     threading.Thread(target=thief.serve_forever, daemon=True).start()
-    context = browser.new_context()
+    context = browser.new_context(viewport=SMALL)
     page = context.new_page()
     try:
         page.goto(server.link())
-        page.wait_for_url("**/operate-*/")
+        page.wait_for_url("**/operate-*/", wait_until="commit")
         assert context.cookies()
         page.evaluate(f"location.href = 'http://127.0.0.1:{thief.server_port}/operate'")
         assert until(lambda: received) and not any(received)
@@ -91,7 +94,7 @@ def test_another_server_of_this_machine_is_sent_no_cookie(browser, server):
 
 
 def test_a_pasted_link_opens_the_page_and_a_wrong_one_says_why(browser, server):
-    context = browser.new_context()
+    context = browser.new_context(viewport=SMALL)
     page = context.new_page()
     page.goto(server.origin)
     page.get_by_label("Link").fill("x" * 32)
@@ -99,7 +102,7 @@ def test_a_pasted_link_opens_the_page_and_a_wrong_one_says_why(browser, server):
     page.get_by_text("not, or no longer, valid").wait_for()
     page.get_by_label("Link").fill(server.link())
     page.get_by_role("button", name="Open").click()
-    page.wait_for_url("**/operate-*/")
+    page.wait_for_url("**/operate-*/", wait_until="commit")
     context.clear_cookies()
     page.reload()
     page.get_by_text("no longer valid").wait_for()
@@ -151,7 +154,7 @@ def test_new_links_end_all_that_the_old_ones_opened(operator_server):
     browsers = {role: Browser(server, role) for role in ("operate", "watch")}
     asking, other, watching = browsers["operate"].client(), browsers["operate"].client(), browsers["watch"].client()
     old = {role: grant.token for role, grant in server.access.grants.items()}
-    server.renew_links(asking.number)
+    server.renew_links(asking.number, leaving_s=1.0)
     for client in (other, watching):
         client.thread.join(HANG_S)
         assert not client.thread.is_alive()
@@ -426,8 +429,8 @@ def test_a_slow_name_server_is_not_waited_for(monkeypatch):
 
     monkeypatch.setattr(socket, "getaddrinfo", look_up)
     with raises(SlviewerError, "slow.example", "127.0.0.1"):
-        serve(Serving("slow.example", 0))
-    assert asked.is_set() and not answered
+        serve(Serving("slow.example", 0), resolve_s=0.1)
+    assert asked.wait(HANG_S) and not answered
     answering.set()
     assert until(lambda: answered)
 
