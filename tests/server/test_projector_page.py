@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from clocks import HANG_S, until
 from facts import missing_facts, raises
-from playwright.sync_api import Browser, Page, expect
+from playwright.sync_api import Browser, BrowserContext, Page, expect
 from websockets.exceptions import ConnectionClosed
 
 from slviewer.devices.browser import PageChannels
@@ -37,24 +37,70 @@ def channel(server: SafeServer) -> Iterator[ProjectorChannel]:
     server.device_pages.clear()
 
 
+class Window:
+    """A window of SIZE in a browser of its own, in which one test after another opens its page."""
+
+    def __init__(self, context: BrowserContext) -> None:
+        self.errors: list[str] = []
+        self.is_used = False
+        self._context = context
+        self._page: Page | None = None
+
+    def open(self, server: SafeServer) -> Page:
+        """Open the projector page, by its link the first time."""
+        self.is_used = True
+        if self._page is None or self._page.is_closed():
+            self._page = follow_link(self._context, server, self.errors)
+        else:
+            self._page.goto(f"{server.origin}{server.access.grants['project'].path}/")
+        return self._page
+
+    def leave(self) -> None:
+        """Leave the page, so that nothing of it stays."""
+        self.is_used = False
+        self.errors.clear()
+        if self._page is not None and not self._page.is_closed():
+            self._page.set_viewport_size({"width": SIZE[0], "height": SIZE[1]})
+            self._page.evaluate("sessionStorage.clear()")
+            self._page.goto("about:blank")
+
+
+def follow_link(context: BrowserContext, server: SafeServer, errors: list[str]) -> Page:
+    """Open the projector page in a new window; `errors` are those of its scripts."""
+    page = context.new_page()
+    page.on("pageerror", lambda error: errors.append(str(error)))
+    page.goto(server.link("project"))
+    page.wait_for_url("**/project-*/")  # the token does not stay in the address
+    return page
+
+
+@pytest.fixture(scope="module")
+def usual(browser: Browser, server: SafeServer) -> Iterator[Window]:
+    context = browser.new_context(viewport={"width": SIZE[0], "height": SIZE[1]})
+    yield Window(context)
+    context.close()
+
+
 @pytest.fixture
-def opens(browser: Browser, server: SafeServer) -> Iterator[Opens]:
-    """Opens a projector page in a browser of its own, whose screen is its window unless another one is given."""
+def opens(browser: Browser, server: SafeServer, usual: Window) -> Iterator[Opens]:
+    """Opens a projector page, whose screen is its window unless another one is given; only the first usual one is in a
+    browser that other tests use.
+    """
     contexts, errors = [], []
 
     def opened(size: tuple[int, int] = SIZE, ratio: float = 1.0, screen: tuple[int, int] | None = None) -> Page:
+        if (size, ratio, screen) == (SIZE, 1.0, None) and not usual.is_used:
+            return usual.open(server)
         width, height = (math.ceil(side / ratio) for side in size)
         whole = {"width": screen[0], "height": screen[1]} if screen else None
         viewport = {"width": width, "height": height}
-        context = browser.new_context(viewport=viewport, screen=whole, device_scale_factor=ratio)
-        contexts.append(context)
-        page = context.new_page()
-        page.on("pageerror", lambda error: errors.append(str(error)))
-        page.goto(server.link("project"))
-        page.wait_for_url("**/project-*/")  # the token does not stay in the address
-        return page
+        contexts.append(browser.new_context(viewport=viewport, screen=whole, device_scale_factor=ratio))
+        return follow_link(contexts[-1], server, errors)
 
     yield opened
+    errors += usual.errors
+    if usual.is_used:
+        usual.leave()
     for context in contexts:
         context.close()
     assert not errors
