@@ -1,5 +1,6 @@
 """Wherever the program is killed while it writes, or the disk refuses: nothing saved is lost, and work goes on."""
 
+import shutil
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -115,9 +116,10 @@ def test_a_replacement_is_the_old_or_the_new(tmp_path, sequence, new, fault):
             session.save_result("clouds/pose_1", {"made": "old"}, {"a": np.arange(5)})
         return folder
 
-    attempt(prepare(tmp_path / "dry"), counted := Disk(None))
+    old = prepare(tmp_path / "old")
+    attempt(shutil.copytree(old, tmp_path / "dry"), counted := Disk(None))
     for at in points(counted.calls, 12):
-        folder = prepare(tmp_path / f"session_{at}")
+        folder = shutil.copytree(old, tmp_path / f"session_{at}")
         with suppress(Killed, SessionError):
             attempt(folder, Disk(at, FAULTS[fault]))
         there = whole_captures(folder)
