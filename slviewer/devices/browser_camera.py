@@ -19,6 +19,8 @@ from slviewer.errors import DeviceError, InputError
 
 FRAME_S = 10.0
 """How long a picture may take, from the request until it has arrived here."""
+SETTLING_MS = 700.0
+"""How long a camera takes to act on a setting."""
 _LOCK_S = 8.0
 """How long the camera may take to reach the settings that it is locked at."""
 _MAX_SIDE_PX = 2**13
@@ -73,8 +75,9 @@ class CameraChannel(PageChannel[Video]):
     name = "the camera page"
     remedy = "open the camera's link on the phone or laptop whose camera is used"
 
-    def __init__(self, answer_s: float = ANSWER_S) -> None:
+    def __init__(self, answer_s: float = ANSWER_S, settling_ms: float = SETTLING_MS) -> None:
         super().__init__(answer_s)
+        self.settling_ms = settling_ms
         self._frame_size: tuple[int, int] | None = None
 
     def set_use(self, size: tuple[int, int] | None) -> None:
@@ -177,7 +180,7 @@ class BrowserCamera(Openable):
         try:
             self._pages.set_use(self.size)
             page = self._pages.page()
-            page.request("lock", timeout_s=_LOCK_S, exposure_ms=self._exposure_ms)
+            self._lock(page, self._exposure_ms)
             self._page = page
         except BaseException:
             self.close()
@@ -207,12 +210,16 @@ class BrowserCamera(Openable):
         """Set the exposure; what could not be set is in `notes`."""
         page, self._note = self._require_page(), ""
         if settings.exposure_ms is not None:
-            page.request("lock", timeout_s=_LOCK_S, exposure_ms=settings.exposure_ms)
+            self._lock(page, settings.exposure_ms)
             if page.facts.exposure_ms is None:
                 self._note = "its browser sets no exposure: change the light or the projector's brightness instead"
         if settings.gain is not None:
             self._note = "browsers set no gain: change the exposure instead"
         return self.settings()
+
+    def _lock(self, page: PageConnection[Video], exposure_ms: float | None) -> None:
+        """Lock what is automatic, at an exposure where one is given, and wait until the camera has settled."""
+        page.request("lock", timeout_s=_LOCK_S, exposure_ms=exposure_ms, settling_ms=self._pages.settling_ms)
 
     def _request_picture(self, channel: Channel | Literal["rgb"], depth: int) -> np.ndarray:
         """Request a picture taken from now on, and return it, (h, w, depth) uint8."""

@@ -9,7 +9,7 @@ import pytest
 from clocks import HANG_S
 from facts import missing_facts, raises
 
-from slviewer.devices.browser_camera import BrowserCamera, CameraChannel, Video
+from slviewer.devices.browser_camera import SETTLING_MS, BrowserCamera, CameraChannel, Video
 from slviewer.devices.protocols import CameraSettings
 from slviewer.errors import DeviceError, InputError
 
@@ -28,7 +28,7 @@ class Phone:
     """A page that answers every request; `pictures` are what it sends, and `settings` what it was told to lock."""
 
     def __init__(self, channel: CameraChannel, shown: Video = VIDEO) -> None:
-        self.channel, self.settings, self.asked = channel, [], []
+        self.channel, self.settings, self.settling_ms, self.asked = channel, [], [], []
         self.pictures: dict[str, bytes] = {"green": bytes(range(12)), "rgb": bytes(range(36))}
         self.why = ""
         self.page = channel.connect(hello(shown), self.receive)
@@ -46,6 +46,7 @@ class Phone:
         content = self.pictures[request["channel"]] if request["op"] == "grab" else b""
         if request["op"] == "lock":
             self.settings.append(request["exposure_ms"])
+            self.settling_ms.append(request["settling_ms"])
         done = msgspec.json.encode({"op": "done", "number": request["number"], "why": self.why})
         answer = struct.pack("<I", len(done)) + done + content if content else done.decode()
         self.channel.handle_message(self.page, answer)
@@ -88,6 +89,7 @@ def test_pictures_arrive_byte_for_byte() -> None:
     phone = Phone(channel)
     camera = BrowserCamera(exposure_ms=5.0, page=channel)
     camera.open()
+    assert phone.settling_ms == [SETTLING_MS]
     out = np.zeros((3, 4), np.uint8)
     camera.grab(out)
     assert np.array_equal(out, np.arange(12).reshape(3, 4))

@@ -94,7 +94,7 @@ def phone(browser: Browser, film: Film) -> Iterator[Browser]:
 
 @pytest.fixture
 def channel(server: SafeServer) -> Iterator[CameraChannel]:
-    pages = PageChannels(camera=CameraChannel(answer_s=HANG_S))
+    pages = PageChannels(camera=CameraChannel(HANG_S, settling_ms=0.0))  # a film does not change by itself
     serve_device_pages(server, pages)
     yield pages.camera
     server.device_pages.clear()
@@ -192,7 +192,7 @@ def test_a_scan_by_a_phone_measures_the_plane(phone, film, opens, channel, tmp_p
 
 def test_the_page_works_encrypted_by_the_certificate_made_here(phone, film, tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
-    server, pages = serve(Serving(port=0, tls=True)), PageChannels()
+    server, pages = serve(Serving(port=0, tls=True)), PageChannels(camera=CameraChannel(HANG_S, settling_ms=0.0))
     serve_device_pages(server, pages)
     context = phone.new_context(ignore_https_errors=True)  # as a person who has compared the fingerprint
     try:
