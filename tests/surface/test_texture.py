@@ -50,6 +50,13 @@ def textured() -> TexturedMesh:
     return texture_mesh(Mesh(sphere.vertices, sphere.faces), scans, poses, size=512, light=LIGHT)
 
 
+def made_up() -> tuple[Mesh, np.ndarray, np.ndarray]:
+    """A sphere with coordinates uv (n, 2) and an image (512, 512, 3) of chance, to be written and read back."""
+    sphere, chance = trimesh.creation.icosphere(3, RADIUS), np.random.default_rng(4)
+    image = chance.integers(0, 256, (512, 512, 3)).astype(np.uint8)
+    return Mesh(sphere.vertices, sphere.faces), chance.random((len(sphere.vertices), 2)), image
+
+
 def shown(textured: TexturedMesh) -> np.ndarray:
     """The image's red at each vertex."""
     size = len(textured.image)
@@ -69,26 +76,26 @@ def test_the_texture_is_the_reflectance_without_shading_and_exposures(textured: 
     assert textured.seen > 0.97 and 0.3 < textured.mm_per_texel < 1.5
     assert 1 <= textured.charts < 60 and 0 < textured.seams < 0.3
     assert len(textured.uv) == len(textured.mesh.vertices) >= 10242 and "px" in textured.text()
+    assert textured.uv.min() >= 0 and textured.uv.max() <= 1
 
 
 @pytest.mark.parametrize("suffix", ["obj", "glb"])
-def test_trimesh_and_open3d_read_mesh_and_image(textured: TexturedMesh, tmp_path: Path, suffix: str) -> None:
-    path = tmp_path / f"part.{suffix}"
-    size = write_textured(path, textured.mesh, textured.uv, textured.image, ("a note",))
+def test_trimesh_and_open3d_read_mesh_and_image(tmp_path: Path, suffix: str) -> None:
+    path, (mesh, uv, picture) = tmp_path / f"part.{suffix}", made_up()
+    size = write_textured(path, mesh, uv, picture, ("a note",))
     assert size == sum(each.stat().st_size for each in tmp_path.iterdir())
     found = trimesh.load(path, force="mesh", process=False, maintain_order=True)
-    assert len(found.faces) == len(textured.mesh.faces)
+    assert len(found.faces) == len(mesh.faces)
     assert found.extents.max() * (1000 if suffix == "glb" else 1) == pytest.approx(2 * RADIUS, rel=1e-3)
-    uv = np.asarray(found.visual.uv)
-    assert uv.min() >= 0 and uv.max() <= 1
+    assert np.allclose(found.visual.uv, uv, atol=1e-5)
     material = found.visual.material
     image = np.asarray(material.baseColorTexture if suffix == "glb" else material.image)
-    assert np.array_equal(image[..., :3], textured.image)
+    assert np.array_equal(image[..., :3], picture)
     o3d = open3d()
     model = o3d.io.read_triangle_model(str(path))
     (material,) = model.materials
-    assert np.asarray(material.albedo_img).shape[:2] == textured.image.shape[:2]
-    assert len(model.meshes[0].mesh.triangles) == len(textured.mesh.faces)
+    assert np.asarray(material.albedo_img).shape[:2] == picture.shape[:2]
+    assert len(model.meshes[0].mesh.triangles) == len(mesh.faces)
     if suffix == "obj":
         assert {each.name for each in tmp_path.iterdir()} == {"part.obj", "part.mtl", "part.png"}
 
@@ -105,7 +112,7 @@ def test_what_stands_in_the_way_leaves_no_trace() -> None:
     assert 0.1 < found.seen < 0.25  # less than half of one ball of two
 
 
-def test_what_cannot_be_textured_is_refused(tmp_path: Path, textured: TexturedMesh) -> None:
+def test_what_cannot_be_textured_is_refused(tmp_path: Path) -> None:
     sphere = trimesh.creation.icosphere(2, RADIUS)
     mesh = Mesh(sphere.vertices, sphere.faces)
     scan, pose = painted("front", 1.0), {"front": looking_from(SIDES["front"], AWAY)}
@@ -114,4 +121,4 @@ def test_what_cannot_be_textured_is_refused(tmp_path: Path, textured: TexturedMe
     with raises(InputError, "100 px", 512, 8192):
         texture_mesh(mesh, {"front": scan}, pose, size=100)
     with raises(InputError, "part.stl", ".glb", ".obj"):
-        write_textured(tmp_path / "part.stl", textured.mesh, textured.uv, textured.image)
+        write_textured(tmp_path / "part.stl", *made_up())
