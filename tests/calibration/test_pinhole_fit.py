@@ -38,6 +38,7 @@ def cloud_offsets(splined: SplinedModel, true, lens: Lens) -> np.ndarray:
     return np.asarray(np.linalg.norm(lens.project(points[v, u].astype(float)) - np.column_stack([u, v]), axis=1))
 
 
+@pytest.mark.slow
 @pytest.mark.computes
 def test_the_fit_reproduces_the_clouds_pixels(models, true) -> None:
     _, splined = models

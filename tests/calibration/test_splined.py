@@ -53,6 +53,7 @@ def measured(model, true, depths=DEPTHS) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate(found), np.concatenate(truth)
 
 
+@pytest.mark.slow
 def test_space_is_right_in_front_of_inside_and_behind_the_calibrated_depths(model, stereo, true) -> None:
     found, truth = measured(model, true)
     assert len(truth) > 30_000

@@ -148,6 +148,7 @@ def test_the_compiled_form_is_the_exact_one(model, true) -> None:
     assert np.abs(model.rays[:, height // 2, width // 2] - central).max() < 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.computes
 def test_depth_noise_follows_from_the_phase_noise(model, true) -> None:
     z = np.full(true.camera.size[::-1], 600.0)

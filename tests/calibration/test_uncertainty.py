@@ -52,6 +52,7 @@ def illuminated(model: SplinedModel) -> tuple[np.ndarray, np.ndarray]:
     return model.bundle.camera_poses > 0, model.bundle.projector_poses > 0
 
 
+@pytest.mark.slow
 @pytest.mark.computes
 def test_the_working_volume_is_what_both_see_in_front_of_inside_and_behind_the_calibrated_depths(model) -> None:
     near, far = model.bundle.depth_range_mm
@@ -153,6 +154,7 @@ def test_the_map_says_at_each_pixel_what_the_covariance_says_there(model) -> Non
     assert 0.9 < np.median(ratio) < 1.2 and np.percentile(ratio, 5) > 0.7 and np.percentile(ratio, 95) < 1.6
 
 
+@pytest.mark.slow
 @pytest.mark.computes
 def test_a_cloud_knows_its_noise_and_its_calibration_apart_and_its_file_holds_them(
     stereo_and_model, true, tmp_path

@@ -87,6 +87,7 @@ def true_test(bars):
     return outcome(Artefact.from_dict(GIVEN), bars, true_model())
 
 
+@pytest.mark.slow
 @pytest.mark.computes
 def test_the_true_rig_measures_a_ball_bar_to_its_noise(true_test):
     for position in true_test.positions:
@@ -104,6 +105,7 @@ def test_the_true_rig_measures_a_ball_bar_to_its_noise(true_test):
     assert [p.incidence["R1"] for p in true_test.positions].count(100.0) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.computes
 def test_a_scale_error_of_200_ppm_is_found(bars, true_test):
     wrong = outcome(Artefact.from_dict(GIVEN), bars, true_model(200e-6))

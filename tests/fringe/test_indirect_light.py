@@ -72,6 +72,7 @@ def test_a_single_reflection_is_not_masked(sequence_of, name):
     assert np.mean(phase.reason[renderer_of(name).truth().mask] == Reason.INDIRECT) < 0.005
 
 
+@pytest.mark.slow
 def test_the_definition_masks_the_same_pixels():
     sequence, frames = captured(MISLED, p18)
     ours, reference = decode(sequence, frames, "x"), decode_reference(sequence, frames, "x")

@@ -155,6 +155,7 @@ def count_selected(page: Page) -> int:
     return int(text.split(" of ")[0].replace(",", ""))
 
 
+@pytest.mark.slow
 def test_points_are_selected_deleted_and_restored(wizard: tuple[Opened, App, Operator, Views]) -> None:
     opened, app, operator, views = wizard
     page = opened.page

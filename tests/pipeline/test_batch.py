@@ -144,6 +144,7 @@ def made_in(session: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in (session / "exports").iterdir()}
 
 
+@pytest.mark.slow
 @pytest.mark.computes
 @pytest.mark.parametrize(
     "scheduler", ["threads", pytest.param("processes", marks=[pytest.mark.process, pytest.mark.slow])], indirect=True

@@ -19,6 +19,7 @@ BUDGETS = (
 )
 
 
+@pytest.mark.slow
 @pytest.mark.computes
 @pytest.mark.parametrize(
     ("camera", "projector", "distance"),

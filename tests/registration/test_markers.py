@@ -97,6 +97,7 @@ def test_a_plane_and_its_corners(plates, on_plates) -> None:
     assert 0.2 < np.sqrt(np.mean(gap**2)) / np.sqrt(np.mean(sigma**2)) < 1.3, "what is predicted"
 
 
+@pytest.mark.slow
 def test_scans_that_do_not_overlap_are_joined_by_markers_alone(plates, on_plates) -> None:
     """Each shows one half of the plate's surface, both all of its markers."""
     halves = {}
@@ -109,6 +110,7 @@ def test_scans_that_do_not_overlap_are_joined_by_markers_alone(plates, on_plates
     assert 0.0005 < largest_error(plates, alignment.T_reference_scan["b"], true_motion(pose(0), pose(1))) < 0.1
 
 
+@pytest.mark.slow
 def test_a_marker_that_was_moved_is_named_and_one_of_two_is_undecidable(on_plates) -> None:
     a, b = on_plates["a"], on_plates["b"]
     corners = b.corners.copy()
@@ -138,6 +140,7 @@ def test_a_number_that_is_seen_twice_is_left_out_and_reported() -> None:
     assert missing_facts(notes[0], 7, "one") == [] and len(notes) == 3
 
 
+@pytest.mark.slow
 def test_one_marker_alone_does_not_join_scans_without_overlap(plates, on_plates) -> None:
     one = {n: replace(m, ids=m.ids[:1], corners=m.corners[:1], sigma_mm=m.sigma_mm[:1]) for n, m in on_plates.items()}
     halves = {}

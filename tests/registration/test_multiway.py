@@ -133,6 +133,7 @@ def turn() -> Alignment:
     return register_all(scans, "turn_03", Starts(table_deg=dict(zip(scans, 60.0 * np.arange(6), strict=True))))
 
 
+@pytest.mark.slow
 def test_a_turn_closes(turn: Alignment) -> None:
     for k, T in enumerate(turn.T_reference_scan.values()):
         shift, deg = off(T, TABLE.rotation(60.0 * (2 - k)))

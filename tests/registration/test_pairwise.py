@@ -36,6 +36,7 @@ def registered() -> Registration:
     return register(*SCANS)
 
 
+@pytest.mark.slow
 def test_the_same_scans_give_the_same_pose(registered: Registration) -> None:
     np.testing.assert_allclose(register(*SCANS).T_reference_scan, registered.T_reference_scan, atol=1e-7)
 
@@ -67,6 +68,7 @@ def test_gates_follow_the_size_of_the_object(scale: float) -> None:
     assert result.gate_mm < 10.0 if scale > 1 else result.gate_mm < 0.6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("relief", "other"), [pytest.param(12.0, 52, marks=pytest.mark.slow), (3.0, 58)])
 def test_unrelated_shapes_are_refused(other: int, relief: float) -> None:
     with pytest.raises(SlviewerError):

@@ -94,6 +94,7 @@ def test_an_object_alone_has_nothing_that_stands_still() -> None:
     assert found.contradictions["b", "a"].share < 0.01 and found.contradictions["b", "a"].compared > 1000
 
 
+@pytest.mark.slow
 def test_a_scan_that_is_all_holes_says_where_its_points_are_lost() -> None:
     clouds = dict(scans(25.0, wall=True)[0])
     sparse = clouds["b"].points.copy()
@@ -114,6 +115,7 @@ def test_steps_within_the_noise_are_no_edges() -> None:
     assert away_from_edges(points, np.full(z.shape, 3.0)).mean() > 0.6
 
 
+@pytest.mark.slow
 def test_contradictions_are_counted_where_one_scan_sees_through_the_others_points() -> None:
     clouds, wall = scans(2.0, wall=True)
     views = {name: sample_surface(cloud.measured) for name, cloud in clouds.items()}

@@ -79,6 +79,7 @@ def test_every_experiment_shows_its_figures(reproduction: list[Section]) -> None
         assert word in alts
 
 
+@pytest.mark.slow
 def test_the_letters_own_figures_stand_beside_ours(tables: list[Section]) -> None:
     words = "\n".join(texts(section) for section in tables)
     letter = (0.253, 0.141, 0.237, 0.184, 0.087, "3.59 × better", 98.44, 0.26, 0.25, "1,642,179")

@@ -50,6 +50,7 @@ for line in sys.stdin:
 """Starts one writer a line of its input, height of the frames and number of the change to the disk in which it dies."""
 
 
+@pytest.mark.slow
 @pytest.mark.process
 @pytest.mark.parametrize(
     ("seed", "kills"), [pytest.param(0, 2, id="few"), pytest.param(1, 10, id="many", marks=pytest.mark.slow)]

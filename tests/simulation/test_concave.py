@@ -32,6 +32,7 @@ def coordinate_errors(sequence_of, angle_deg=90.0, bounces=2):
     return (phase.coordinate - truth.projector[..., 0])[valid], phase.sigma_px[valid]
 
 
+@pytest.mark.slow
 def test_a_wall_of_a_groove_receives_what_the_formula_of_two_strips_says():
     """In the middle of a long wall: (1 + (cos a - s) / sqrt(1 + s^2 - 2 s cos a)) / 2 at s widths from the fold."""
     scene = groove(Pose(np.eye(3), np.array([0, 0, 640.0])), 70, length_mm=900)

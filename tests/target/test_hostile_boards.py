@@ -56,6 +56,7 @@ def distance(pixels: np.ndarray, truth: np.ndarray, half_turn: bool) -> np.ndarr
     return turned if half_turn and turned.max() < straight.max() else straight
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("board", [SYMMETRIC, *often(ASYMMETRIC)], ids=str)
 def test_a_board_among_clutter_is_detected_in_order(board: Board) -> None:
     detected, errors = 0, []

@@ -71,6 +71,7 @@ def test_a_chessboard_is_found_by_either_notation(real_data: Path, pose: int) ->
     assert np.count_nonzero(mask) == pytest.approx(9.9 * 7.9 * squares, rel=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("notation", ["chessboard:8x7:75", *often("chessboard:8x6:75")])
 def test_a_larger_chessboard_is_named(real_data: Path, notation: str) -> None:
     image = photograph(real_data / "kamino_procam_jpg90" / "capture_2" / "graycode_40.jpg")

@@ -45,6 +45,7 @@ def test_every_cause_has_a_fault_here() -> None:
     assert {cause for cause, _ in FAULTS.values()} == {FAULTS[name][0] for name in ALL}
 
 
+@pytest.mark.slow
 @pytest.mark.computes
 @pytest.mark.parametrize("fault", [*FEW, *(pytest.param(fault, marks=pytest.mark.slow) for fault in REST)])
 def test_each_cause_is_named_first(fault: str) -> None:

@@ -111,6 +111,7 @@ def assert_all_is_measured(snapshot: Snapshot, acts: list[str]) -> None:
     assert 130 < width.quantities[0].value < 150  # the ammonite's
 
 
+@pytest.mark.slow
 def test_poses_are_asked_for_until_the_wanted_sigma_is_reached(operator: Operator) -> None:
     assert operator.set_wanted_sigma(0.0001) and operator.set_hands_free(True)
     snapshot = operator.wait_until_idle(HANG_S)
@@ -125,6 +126,7 @@ def test_poses_are_asked_for_until_the_wanted_sigma_is_reached(operator: Operato
     assert snapshot.step("poses").state == "done"
 
 
+@pytest.mark.slow
 def test_panels_find_what_they_draw(operator: Operator) -> None:
     store = operator.session
     assert store is not None
@@ -141,6 +143,7 @@ def test_panels_find_what_they_draw(operator: Operator) -> None:
     assert result_views.merged_cloud(store, "1").normals is not None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("where", "make"),
     [

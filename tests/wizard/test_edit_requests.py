@@ -58,6 +58,7 @@ def view(operator: Operator) -> SessionView:
     return session
 
 
+@pytest.mark.slow
 def test_edits_and_region_change_what_is_measured_and_merged(operator: Operator) -> None:
     store = operator.session
     assert store is not None

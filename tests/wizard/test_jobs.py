@@ -188,6 +188,7 @@ def read_memory_mb() -> float:
     return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other C libraries are left alone")
 def test_memory_freed_between_blocks_in_use_is_returned() -> None:
     blocks = [b"x" * 100_000 for _ in range(2000)]  # smaller than what the system gives in whole pages

@@ -77,6 +77,7 @@ def lacks(operator: Operator, *facts: object) -> list[str]:
     return missing_facts(last(operator), *facts)
 
 
+@pytest.mark.slow
 def test_what_is_clicked_is_measured_and_true(operator: Operator) -> None:
     assert operator.snapshot().step("measure").state == "ready"
     on = operator.surface("balls")

@@ -135,6 +135,7 @@ def test_picked_pairs_start_a_merge(operator: Operator) -> None:
     assert missing_facts(settled(operator)[0].merge_failure, "one line") == []
 
 
+@pytest.mark.slow
 def test_scans_as_they_lie_need_no_search_and_a_ball_holds_nothing(operator: Operator) -> None:
     assert operator.merge(["first", "first"], "second", start="identity")
     merge = settled(operator)[1]

@@ -160,6 +160,7 @@ def test_an_open_session_can_be_opened_again_by_any_path_and_with_another_rig(
     assert operator.wait_for(lambda s: s.rig.exposure_ms == 1.5, HANG_S)
 
 
+@pytest.mark.slow
 def test_a_recording_is_not_asked_for_light_that_it_does_not_hold(operator: Operator, tmp_path: Path) -> None:
     capture(tmp_path / "recorded", "a", RIG, patterns="p18")
     assert operator.set_light("pattern") and operator.wait_for(lambda s: s.rig.light == "pattern", HANG_S)
