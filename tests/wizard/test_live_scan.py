@@ -80,6 +80,7 @@ def test_slow_clouds_have_a_rate_too() -> None:
     assert live_scan._compute_rate(deque([0.0]), 1.0) == 0.0
 
 
+@pytest.mark.slow
 def test_clouds_stream_are_kept_and_give_way_to_a_capture(wizard: Wizard) -> None:
     operator = wizard.operator
     assert not operator.save_live() and wizard.reports("error", "live")
