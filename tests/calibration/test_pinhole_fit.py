@@ -67,6 +67,7 @@ def _bent() -> tuple[StereoModel, SplinedModel]:
     return stereo, calibrate_splined(seen, stereo, cells_across=CELLS)
 
 
+@pytest.mark.slow
 @pytest.mark.computes
 def test_the_exported_file_is_the_models_own_and_names_its_frame(models, true, tmp_path: Path) -> None:
     stereo, splined = models

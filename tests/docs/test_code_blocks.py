@@ -186,7 +186,7 @@ def test_the_python_of_a_page_runs(page: Path, tmp_path: Path, monkeypatch) -> N
 
 def test_the_page_of_rig_files_names_every_option() -> None:
     page = (ROOT / "docs" / "reference" / "rig-files.md").read_text(encoding="utf-8")
-    provided = {"board", "world", "page", "clock"}  # by the program
+    provided = {"board", "world", "page", "timing"}  # by the program
     for name, found in builtin_drivers().items():
         for part in ("camera", "projector", "turntable", "rig"):
             make = rig_factory(found) if part == "rig" else getattr(found, part)

@@ -82,8 +82,9 @@ def points_of(model, phase):
     return points, fast.depth_per_px(phase.phase, per_rad) * np.float32(per_rad) * phase.sigma_phase
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", [pixelwise, splined])
-@pytest.mark.parametrize("dtype", [np.uint8, pytest.param(np.uint16, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("dtype", [np.uint8, pytest.param(np.uint16)])
 @pytest.mark.parametrize(
     "name",
     [
@@ -112,6 +113,7 @@ def test_it_is_the_definition(name, dtype, make):
     np.testing.assert_array_equal(scan.texture, texture(sequence, frames))
 
 
+@pytest.mark.slow
 def test_misread_edges_are_moved_and_measured_again():
     sequence, model = SEQUENCES["18 steps and Gray code"], pixelwise()
     frames = frames_of(sequence)
@@ -127,6 +129,7 @@ def test_misread_edges_are_moved_and_measured_again():
     assert lost.any() and np.isnan(before.points[lost]).all()
 
 
+@pytest.mark.slow
 def test_arrays_and_light_are_used_again():
     sequence = SEQUENCES["three frequencies of 4 steps"]
     one = OnePass(sequence, pixelwise(16.0), "x")

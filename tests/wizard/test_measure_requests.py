@@ -116,6 +116,8 @@ def test_what_is_clicked_is_measured_and_true(operator: Operator) -> None:
 
 
 def test_what_cannot_be_measured_is_said_and_nothing_kept(operator: Operator) -> None:
+    place = place_at(operator.surface("balls"), np.zeros(3), CENTRES[0] - [0, 0, RADIUS])
+    assert operator.measure("balls", add_point, place)
     before = now(operator).measurements
     assert operator.measure("balls", add_fit, "plane", Region.ball(CENTRES[0] - [0, 0, RADIUS], 15.0))
     assert lacks(operator, "bends") == []
