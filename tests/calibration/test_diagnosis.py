@@ -64,6 +64,7 @@ def test_a_sound_calibration_is_good() -> None:
     assert len(found.observations) == 8 and not found.excluded
 
 
+@pytest.mark.slow
 @pytest.mark.computes
 @pytest.mark.parametrize(
     "order",

@@ -64,6 +64,7 @@ def test_space_is_right_in_front_of_inside_and_behind_the_calibrated_depths(mode
     assert np.sqrt(np.mean(theirs**2)) > 10 * rms
 
 
+@pytest.mark.slow
 def test_the_board_is_found_as_it_is(model, true) -> None:
     bundle = model.bundle
     scene = printed_board(BOARD, poses(true, 1)[0], SHAPE, true.seed)

@@ -52,6 +52,7 @@ def bent(state: State, rng: np.random.Generator) -> State:
     return state.step(step)
 
 
+@pytest.mark.slow
 @pytest.mark.computes
 def test_every_derivative_agrees_with_differences(seen, stereo) -> None:
     rng = np.random.default_rng(0)
@@ -177,6 +178,7 @@ def exact_point(state: State, pixel: np.ndarray, coordinate: float, guess: float
     return np.array([*undistort_pixel(state.rig.camera, *pixel, np.zeros((4, 4))), 1.0]) * depth
 
 
+@pytest.mark.slow
 @pytest.mark.computes
 def test_points_answer_to_the_unknowns_as_differences_say(model) -> None:
     bundle = model.bundle
@@ -198,6 +200,7 @@ def test_points_answer_to_the_unknowns_as_differences_say(model) -> None:
         bundle.point_jacobian("z", pixels, z)  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 @pytest.mark.computes
 def test_the_covariance_predicts_true_errors_once_rigid_motion_is_removed(model, true) -> None:
     shape = true.camera.size[::-1]

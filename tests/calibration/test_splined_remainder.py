@@ -13,6 +13,7 @@ def _corrected(z: np.ndarray, cell: np.ndarray, rest: np.ndarray, grid: np.ndarr
     add_corrections(z, cell, rest, grid, step, row)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("layers", [1, 2, 9], ids=["one layer", "two neighbours", "any"])
 @pytest.mark.parametrize("step", [3, 8, 16])
 def test_the_grid_is_added_between_its_eight_nodes(layers: int, step: int) -> None:

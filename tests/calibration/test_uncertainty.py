@@ -91,6 +91,7 @@ def test_a_rigid_motion_is_taken_away_and_nothing_else() -> None:
         remove_rigid_motion(both, points, np.arange(40) < 2)
 
 
+@pytest.mark.slow
 @pytest.mark.computes
 def test_it_is_as_wrong_as_it_says(model, true) -> None:
     found = compare_with_truth(model, true)
@@ -130,6 +131,7 @@ def test_a_smooth_field_goes_on_farther_than_independent_differences_do() -> Non
     assert persistence_ratio(Device(np.zeros(10), waves, size), np.zeros((20, 26), bool)) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.computes
 def test_the_map_says_at_each_pixel_what_the_covariance_says_there(model) -> None:
     bundle, (near, far) = model.bundle, model.depths_mm

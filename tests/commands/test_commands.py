@@ -88,6 +88,7 @@ def test_a_mesh_with_a_texture(calibrated: dict, session: Path, run: Run, tmp_pa
     assert status == 2 and not missing_facts(error, ".glb", ".obj")
 
 
+@pytest.mark.slow
 def test_merge_the_object(calibrated: dict, session: Path, run: Run, tmp_path: Path) -> None:
     ply, out = session / "exports" / "merged_1.ply", tmp_path / "merge.json"
     status, text, _ = run("merge", session, "object_r1", "object_r2", "--reference", "object_r3", "--json", out)
@@ -157,6 +158,7 @@ def test_reproduce_remakes_the_letters_tables_and_figures(
     assert page.count("data:image/webp;base64") >= 14 and "http://" not in page.replace("http://www.w3.org", "")
 
 
+@pytest.mark.slow
 def test_calibrate_names_an_excluded_pose_and_does_not_use_it(recorded: Path, run: Run, tmp_path: Path) -> None:
     session = shutil.copytree(recorded / "session", tmp_path / "session")
     with Session.open(session, write=True) as store:
@@ -167,6 +169,7 @@ def test_calibrate_names_an_excluded_pose_and_does_not_use_it(recorded: Path, ru
         assert "pose_02" not in load_stereo(store).poses
 
 
+@pytest.mark.slow
 def test_a_calibration_made_elsewhere_reconstructs_the_same(
     calibrated: dict, session: Path, run: Run, tmp_path: Path
 ) -> None:

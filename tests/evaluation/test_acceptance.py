@@ -115,6 +115,7 @@ def test_a_scale_error_of_200_ppm_is_found(bars, true_test):
     assert low < 200 < high and wrong.scale.U_ppm < 150
 
 
+@pytest.mark.slow
 @pytest.mark.computes
 def test_temperature_is_corrected(bars):
     warm = {**GIVEN, "measured": {**GIVEN["measured"], "temperature_C": 30.0}}
@@ -138,6 +139,7 @@ def test_decisions_heed_the_tests_own_uncertainty(true_test, limit, decision):
     assert missing_facts(judged.text(), judged.decision.upper(), CLAIM) == []
 
 
+@pytest.mark.slow
 @pytest.mark.computes
 @pytest.mark.parametrize("count", [2, pytest.param(6, marks=pytest.mark.slow)])
 def test_planes_are_flat_to_their_noise(count):

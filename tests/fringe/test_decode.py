@@ -105,6 +105,7 @@ def test_deeper_grey_levels():
     assert ten.noise[0] + 400 * ten.noise[1] == pytest.approx(16 * (eight.noise[0] + 100 * eight.noise[1]), rel=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("dtype", "times"), [(np.uint8, 1), (np.uint16, 16), (np.uint16, 257)])
 @pytest.mark.computes
 def test_clipped_pixels_are_saturated_and_noise_at_white_is_not(dtype, times):

@@ -42,6 +42,7 @@ def rms_px(phase):
     return float(np.sqrt(np.nanmean((phase.coordinate - TRUTH)[inner] ** 2)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", variants(SEQUENCES, "four"))
 def test_drifting_exposure_costs_nothing(name):
     sequence = SEQUENCES[name]

@@ -50,6 +50,7 @@ LIGHTS = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SEQUENCES)
 @pytest.mark.parametrize("light", variants(LIGHTS, LIGHTS[2]))
 def test_on_scenes_with_a_depth_step(name, light):
@@ -75,6 +76,7 @@ def test_on_random_frames_of_more_bits(name):
     assert_same(sequence, frames, "y")
 
 
+@pytest.mark.slow
 def test_on_frames_that_are_no_contiguous_array():
     sequence = SEQUENCES["complementary"]
     assert_same(sequence, capture(sequence, step())[:, :, ::2], "x")

@@ -49,6 +49,7 @@ def found(ammonite) -> Deviation:
     return deviation(noisy(points)[seen], nominal, normals=normals[seen], sigma_mm=NOISE)
 
 
+@pytest.mark.slow
 @pytest.mark.computes
 def test_the_simulated_object_deviates_from_its_own_mesh_by_its_noise(found, ammonite) -> None:
     _, _, points, normals = ammonite

@@ -30,6 +30,7 @@ def test_a_sphere_with_strays_has_its_radius_within_its_uncertainty() -> None:
     assert diameter.value == 2 * radius.value and abs(diameter.U / sigma - 4) < 0.05
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("length", "arc"), [(50.0, 6.2), (50.0, 0.7), (5.0, 2.5)], ids=["round", "narrow", "short"])
 def test_a_cylinder_is_found_from_anywhere(length: float, arc: float) -> None:
     points, axis = cylinder(6000, 20.0, length, arc, 0.03)

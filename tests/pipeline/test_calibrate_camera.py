@@ -39,6 +39,7 @@ def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_a_camera_is_calibrated_from_pictures(pictures: Path, run: Run, tmp_path: Path) -> None:
     out, found = tmp_path / "camera.yml", tmp_path / "camera.json"
     status, text, error = run("calibrate", pictures, "--target", BOARD, "--camera-only", "--out", out, "--json", found)

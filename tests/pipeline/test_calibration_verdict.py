@@ -56,6 +56,7 @@ def made(bench: FaultBench, tmp_path: Path) -> Path:
     return tmp_path / "made"
 
 
+@pytest.mark.slow
 def test_a_verdict_is_told_and_kept(session: Path, tmp_path: Path, run: Run) -> None:
     out = tmp_path / "found.json"
     status, text, _ = run("calibrate", session, "--target", BOARD, "--models", "stereo", "--json", out)

@@ -49,6 +49,7 @@ def session(tmp_path: Path, captured: tuple[PatternSequence, np.ndarray]) -> Pat
     return tmp_path / "session"
 
 
+@pytest.mark.slow
 def test_every_command_refuses_other_sizes_and_names_both(session: Path, run: Run) -> None:
     for command in (
         ("reconstruct", session, "large"),

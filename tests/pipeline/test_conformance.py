@@ -236,6 +236,7 @@ def test_a_capture_that_its_layout_cannot_describe_is_skipped_with_the_reason(ca
     assert "oops" in str(imports.skipped[0]) and "two" in str(imports.skipped[0])
 
 
+@pytest.mark.slow
 def test_boards_and_exporters():
     for notation in EXAMPLES.values():
         assert check_board(notation) == []

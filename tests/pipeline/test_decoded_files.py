@@ -106,6 +106,7 @@ def test_files_hold_what_was_decoded(tmp_path: Path, run: Run, part: Captured, f
     assert picture.shape[1] > 1000 and len(np.unique(picture.reshape(-1, 3), axis=0)) > 100
 
 
+@pytest.mark.slow
 def test_gray_code_alone_states_its_quantisation(tmp_path: Path, run: Run) -> None:
     session, out = recorded_session(tmp_path / "session", *captured(gray)), tmp_path / "out"
     assert run("decode", session, "part", "--out", out)[0] == 0

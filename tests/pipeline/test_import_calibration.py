@@ -90,6 +90,7 @@ def test_common_names_are_recognised(tmp_path: Path, names: tuple[str, ...]) -> 
         np.testing.assert_allclose(read[name], matrix, atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "names", [COMMON_NAMES[0], *(pytest.param(names, marks=pytest.mark.slow) for names in COMMON_NAMES[1:])]
 )
@@ -104,6 +105,7 @@ def test_common_names_are_imported_and_stated(session: Path, run: Run, tmp_path:
     assert 450 < np.nanmin(z) < np.nanmax(z) < 750
 
 
+@pytest.mark.slow
 def test_names_that_are_not_known_or_not_unique_are_asked_for(run: Run, tmp_path: Path) -> None:
     path = file(tmp_path, entries(), ("A", "B", "C", "D", "R", "T"))
     status, _, err = run("import", "opencv-calibration", path, tmp_path / "s")
@@ -145,6 +147,7 @@ def test_a_capture_contradicts_a_calibration(
         assert store.deleted_results() == []
 
 
+@pytest.mark.slow
 def test_a_capture_that_arrives_later_contradicts_a_calibration(run: Run, tmp_path: Path) -> None:
     session, path = tmp_path / "s", file(tmp_path, entries(**INVERSE))
     sizes = ("--projector", "456x570", "--camera", "160x120")

@@ -142,6 +142,7 @@ def write_colour(source: Path, exposures: tuple[float, ...] = ()) -> Path:
     return source
 
 
+@pytest.mark.slow
 def test_the_default_channel_of_colour_frames_is_stated_once(run: Run, tmp_path: Path) -> None:
     source, session = write_colour(tmp_path / "source"), tmp_path / "session"
     shutil.copytree(source / "scan", source / "scan_2")

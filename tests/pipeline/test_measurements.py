@@ -244,6 +244,7 @@ def test_the_terminal_measures_relates_names_and_writes_a_table(folder, balls, r
         assert status == 2 and not missing_facts(wrong, option), wrong
 
 
+@pytest.mark.slow
 def test_a_merge_is_measured_on_too(folder, balls, regions) -> None:
     chosen = balls.measured
     with Session.open(folder, write=True) as store:

@@ -184,6 +184,7 @@ def load(session: Path) -> EditHistory:
         return load_edits(store, "one")
 
 
+@pytest.mark.slow
 def test_the_report_and_the_files_list_region_and_edits(session: Path, cloud: np.ndarray, tmp_path: Path) -> None:
     report(session, tmp_path / "before.html")
     assert "Region and edits" not in (tmp_path / "before.html").read_text()
@@ -198,6 +199,7 @@ def test_the_report_and_the_files_list_region_and_edits(session: Path, cloud: np
     assert edited.edits[0] in header and "1000.0 x 1000.0 x 1990.0 mm" in header
 
 
+@pytest.mark.slow
 def test_results_are_stale_once_edits_or_region_change(session: Path, cloud: np.ndarray) -> None:
     merge(session, ["two"], "one", start="identity")
     u, v = (int(i) for i in np.argwhere(np.isfinite(cloud[..., 2]))[2000][::-1])
@@ -219,6 +221,7 @@ def test_results_are_stale_once_edits_or_region_change(session: Path, cloud: np.
     assert states() == ["fresh", "fresh"]
 
 
+@pytest.mark.slow
 def test_a_report_is_checked_with_the_edits_it_was_made_with(session: Path, cloud: np.ndarray, tmp_path: Path) -> None:
     edit_scan(session, "one", polygon=left_half(cloud))
     set_region(session, roi="-500,500,-40,500,10,2000")

@@ -53,6 +53,7 @@ def test_the_texture_of_a_white_balanced_part_is_neutral(session: Path, tmp_path
     assert white / white[1] == pytest.approx(1.0, abs=0.02) and white[1] > 40
 
 
+@pytest.mark.slow
 def test_gains_undo_the_cast_and_keep_overexposed_pixels_neutral(session: Path) -> None:
     with Session.open(session) as store:
         gains = measure_white(store, "card")

@@ -170,6 +170,7 @@ def test_a_wrong_exposure_is_named_with_a_better_one(exposure_ms, verdict, time)
         assert found.verdict == "good"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("hertz", "exposure"), [(100.0, "10 ms"), slow(120.0, "8.33 ms")])
 def test_mains_light_is_named_with_its_frequency(hertz, exposure, looked, lying):
     found = looked(lying(room=25, mains_depth=0.4, mains_hz=hertz))

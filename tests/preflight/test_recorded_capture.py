@@ -61,6 +61,7 @@ def test_a_sound_capture_is_good(tmp_path: Path, sequence_of: Callable) -> None:
     assert all(0.9 < decoded[axis]["decoded_share"] <= 1 for axis in ("x", "y"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("wrong", "frame"),
     [
@@ -89,6 +90,7 @@ def test_darkness_is_checked(tmp_path: Path) -> None:
     assert exposure.verdict == "bad" and 0.05 < exposure.figures["bright_share_of_full_scale"] < 0.12
 
 
+@pytest.mark.slow
 def test_noise_is_checked(tmp_path: Path) -> None:
     sequence, stack = frames_of(p18)
     noisy = gained(stack, 0.25, 60 + 6 * np.random.default_rng(0).standard_normal(stack.shape))
@@ -96,6 +98,7 @@ def test_noise_is_checked(tmp_path: Path) -> None:
     assert noise.verdict == "warning" and 5.5 < noise.figures["x"]["noise_levels"] < 6.5
 
 
+@pytest.mark.slow
 def test_drifting_light_is_checked(tmp_path: Path) -> None:
     sequence, stack = frames_of(p18)
     gains = 1 - 0.2 * np.random.default_rng(0).random(len(stack))
@@ -103,11 +106,13 @@ def test_drifting_light_is_checked(tmp_path: Path) -> None:
     assert flicker.verdict == "warning" and flicker.remedy
 
 
+@pytest.mark.slow
 def test_gamma_is_checked(tmp_path: Path) -> None:
     gamma = checked(tmp_path / "session", *frames_of(p18, gamma=2.2)).check("gamma")
     assert gamma.verdict == "warning" and 1.5 < gamma.figures["gamma"] < 2.6
 
 
+@pytest.mark.slow
 def test_a_description_that_contradicts_the_frames_is_bad(tmp_path: Path) -> None:
     sequence, stack = frames_of(gray)
     smaller = PatternSequence((sequence.projector[0] // 2, sequence.projector[1] // 2), sequence.frames)
@@ -120,6 +125,7 @@ def listed(text: str) -> list[dict[str, str]]:
     return [dict(zip(("verdict", "name"), line.split(), strict=False)) for line in text.splitlines()]
 
 
+@pytest.mark.slow
 def test_the_command_writes_json_and_ends_with_1_for_a_bad_capture(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

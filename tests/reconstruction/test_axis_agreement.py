@@ -63,6 +63,7 @@ def turned(true: StereoRig, mrad: tuple[float, float, float]) -> StereoRig:
     return StereoRig(true.camera, true.projector, R @ true.R, R @ true.t)
 
 
+@pytest.mark.slow
 def test_the_misfit_of_a_sound_capture_is_its_noise() -> None:
     true, found = rig(), coordinates(rig())
     v, u = np.nonzero(np.isfinite(found[..., 0]))

@@ -194,6 +194,7 @@ def never(edge: Edge, T: np.ndarray) -> bool:
     return False
 
 
+@pytest.mark.slow
 def test_one_bad_edge_among_many_is_dropped() -> None:
     poses, edges = ring(8)
     bad = edges[5]

@@ -41,6 +41,7 @@ def test_the_same_scans_give_the_same_pose(registered: Registration) -> None:
     np.testing.assert_allclose(register(*SCANS).T_reference_scan, registered.T_reference_scan, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_the_pose_maps_scan_to_reference_and_back(registered: Registration) -> None:
     back = register(*SCANS[::-1])
     shift, turn = error(registered, np.linalg.inv(back.T_reference_scan))
@@ -48,6 +49,7 @@ def test_the_pose_maps_scan_to_reference_and_back(registered: Registration) -> N
     assert turn < 0.02
 
 
+@pytest.mark.slow
 def test_a_third_of_overlap_is_enough() -> None:
     T = motion(10, 30)
     result = register(view(bumpy(2), (-15, 75), 1, T), view(bumpy(2), (-75, 15), 2))
@@ -97,6 +99,7 @@ def moulding(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return 5.0 * np.sin(x / 8.0) * np.exp(-((x - 10.0) ** 2) / 900.0) + 0.0 * y
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("shape", "reason", "free"),
     [
@@ -112,6 +115,7 @@ def test_a_shape_that_slides_or_turns_is_refused_by_its_name(shape: Height, reas
     assert refusal.value.reason == reason
 
 
+@pytest.mark.slow
 def test_two_poses_that_fit_alike_are_refused_unless_one_is_chosen() -> None:
     def twice(x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """The same from both sides: turned by half a turn, it fits again."""
@@ -148,6 +152,7 @@ def test_picks_that_fix_no_pose_are_refused() -> None:
         fit_picked_start(np.where(triangle == 40, np.nan, triangle), triangle)
 
 
+@pytest.mark.slow
 def test_the_predicted_uncertainty_is_the_true_one() -> None:
     T, shifts, turns, told = motion(10, 30), [], [], []
     for seed in range(5):

@@ -106,6 +106,7 @@ def test_a_scan_that_is_all_holes_says_where_its_points_are_lost() -> None:
     assert trusted < total and 10_000 <= total <= clouds["b"].mask.sum()
 
 
+@pytest.mark.slow
 def test_steps_within_the_noise_are_no_edges() -> None:
     clouds, _ = scans(25.0, wall=True)
     z = clouds["a"].points[..., 2]

@@ -122,6 +122,7 @@ def test_the_pixels_curve_and_its_residuals() -> None:
     opened(pixel_curves(PixelCurve((1, 2), "x", nothing, nothing, nothing, nothing, np.ones(5), np.ones(3))))
 
 
+@pytest.mark.slow
 def test_planes_are_named_by_what_differs() -> None:
     figure = planes_in_space(outlines(), (500, 700))
     opened(figure)
@@ -144,6 +145,7 @@ def test_reprojection_figures() -> None:
     assert missing_facts(coverage("camera", (640, 480), [square, square[:2]]).alt, "50 %") == []
 
 
+@pytest.mark.slow
 def test_clouds_are_counted() -> None:
     points = cloud(160, 590)
     count = f"{np.isfinite(points[..., 2]).sum():,} points"

@@ -86,6 +86,7 @@ def test_the_letters_own_figures_stand_beside_ours(tables: list[Section]) -> Non
     assert missing_facts(words, *letter) == []
 
 
+@pytest.mark.slow
 def test_where_pixelwise_loses_it_is_said(tables: list[Section]) -> None:
     planes = tables[1]
     assert any(isinstance(i, PageNotice) and i.kind == "warning" and "plane_01" in i.text for i in planes.items)

@@ -39,6 +39,7 @@ def test_planes_lie_where_the_letter_had_them():
     assert shares(found["plane_10"])[1] >= 87
 
 
+@pytest.mark.slow
 @pytest.mark.computes
 def test_spheres_and_objects_lie_in_their_ranges():
     for i, scene in enumerate(spheres().values()):

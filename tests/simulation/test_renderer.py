@@ -100,6 +100,7 @@ def test_the_seed_alone_decides_the_frames():
     assert not np.array_equal(first[0], first[1])
 
 
+@pytest.mark.slow
 def test_circles_are_seen_where_they_are():
     rig = letter(0.5)
     board = Board.parse("circles:21x16:9")

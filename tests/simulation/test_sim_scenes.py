@@ -56,6 +56,7 @@ def test_printed_circles_cover_their_share_of_the_plate():
     assert np.array_equal(scene.misplacement, again.misplacement)  # the same board at another pose
 
 
+@pytest.mark.slow
 def test_a_chessboard_s_corners_are_where_its_features_are():
     board = Board.parse("chessboard:9x7:15")
     pose = Pose(np.eye(3), np.array([-60.0, -45.0, 600.0]))

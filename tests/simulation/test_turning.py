@@ -10,6 +10,7 @@ from slviewer.simulation.rig import letter
 from slviewer.simulation.turning import AXIS, AXIS_POINT, STEPS, stone, turning
 
 
+@pytest.mark.slow
 @pytest.mark.computes
 def test_the_stone_is_closed_and_stands_on_a_flat_foot() -> None:
     vertices, triangles = stone()

@@ -74,6 +74,7 @@ def test_what_floats_where_nothing_was_measured_goes_whatever_holes_are_filled(p
     assert len(kept.faces) == len(ball.faces) and (report.filled, report.imagined, report.cut) == (0, 0.0, 1)
 
 
+@pytest.mark.slow
 def test_a_foot_is_closed_flat() -> None:
     """What stood on a table was not measured from below, and its sides lean outwards there: no balloon grows on it."""
     rng = np.random.default_rng(0)
@@ -94,6 +95,7 @@ def test_one_side_alone_is_not_closed() -> None:
         build_mesh(ball(300.0, 0.03, 0), MeshingPlan(watertight=True))
 
 
+@pytest.mark.slow
 def test_a_volume(points: PointSet) -> None:
     found = build_mesh(points, MeshingPlan("volume", fill_holes_mm=6.0))
     assert found.topology.watertight and found.topology.volume_mm3 == pytest.approx(VOLUME, rel=3e-3)
@@ -149,6 +151,7 @@ def test_small_parts_go(closed: BuiltMesh) -> None:
     assert report.largest_mm2 == pytest.approx(0.5)
 
 
+@pytest.mark.slow
 def test_decimating_and_smoothing_report_how_far_they_moved_the_surface(closed: BuiltMesh) -> None:
     thinned, report = decimate(closed.mesh, 3000)
     assert 2900 <= len(thinned.faces) <= 3000 and analyse_topology(thinned).watertight

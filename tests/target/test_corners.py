@@ -82,6 +82,7 @@ def test_a_board_partly_out_of_view_is_refused() -> None:
         detect(CHESSBOARD, replace(SMALL, shift=(90, 0)).render(CHESSBOARD))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("wrong", "tilt"),
     [

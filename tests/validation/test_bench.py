@@ -10,6 +10,7 @@ from slviewer.validation.bench import Benchmark
 from slviewer.validation.bench_rows import megabytes, missing, move_bytes, row, time_beside
 
 
+@pytest.mark.slow
 @pytest.mark.computes
 def test_the_floor_reads_and_writes_every_byte() -> None:
     rng = np.random.default_rng(0)

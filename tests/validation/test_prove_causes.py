@@ -63,6 +63,7 @@ def test_clean_calibrations_raise_no_alarm() -> None:
     assert [(case["causes"], case["level"]) for case in clean] == [([], "good")]
 
 
+@pytest.mark.slow
 @pytest.mark.computes
 @pytest.mark.parametrize("faults", [FEW, pytest.param(REST, marks=pytest.mark.slow)], ids=["few", "rest"])
 def test_the_table_counts_what_was_named(faults: tuple[str, ...]) -> None:

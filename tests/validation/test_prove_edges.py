@@ -20,6 +20,7 @@ def test_the_ridges_of_a_print_are_lower_by_a_factor_of_three(scale: float, blur
     assert 3 < before / after < 50
 
 
+@pytest.mark.slow
 def test_the_edges_of_an_object_stay_as_they_are() -> None:
     before, after = measure_object_edges(letter(0.25, 3))
     assert 0.05 < after <= 1.01 * before < 0.5

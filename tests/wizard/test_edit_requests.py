@@ -86,6 +86,7 @@ def test_edits_and_region_change_what_is_measured_and_merged(operator: Operator)
     assert session.region is not None and not session.region_is_on
 
 
+@pytest.mark.slow
 def test_what_leaves_nothing_is_refused_with_numbers(operator: Operator) -> None:
     store = operator.session
     assert store is not None

@@ -181,6 +181,7 @@ def test_whoever_reads_late_gets_the_newest_and_slows_nobody() -> None:
     assert stream.wait_next() is None and ended == [1]
 
 
+@pytest.mark.slow
 def test_what_moved_between_the_frames_is_masked_and_not_guessed() -> None:
     world = SimulatedWorld(letter(0.2))
     world.place("sphere")
@@ -209,6 +210,7 @@ def test_what_moved_between_the_frames_is_masked_and_not_guessed() -> None:
     assert np.isfinite(moved[wrong]).mean() < 0.1
 
 
+@pytest.mark.slow
 def test_one_pass_gives_what_decoding_and_reconstructing_give() -> None:
     world = SimulatedWorld(letter(0.15))
     world.place("object")

@@ -98,6 +98,7 @@ def test_several_exposures_follow_the_one_that_they_were_chosen_by(operator: Ope
     assert operator.session.decision("exposures") == pytest.approx([0.4, 1.6])
 
 
+@pytest.mark.slow
 def test_a_rig_chosen_once_more_keeps_what_was_measured_and_set(operator: Operator) -> None:
     session = operator.session
     assert session is not None and operator.set_exposure(2.0)
@@ -111,6 +112,7 @@ def test_a_rig_chosen_once_more_keeps_what_was_measured_and_set(operator: Operat
     assert "settle_ms" not in session.decision("rig") and session.decision("exposure") is None
 
 
+@pytest.mark.slow
 def test_what_a_check_finds_belongs_to_the_rig_that_was_checked(operator: Operator) -> None:
     assert operator.check_rig()
     assert operator.wait_for(lambda s: s.rig.capture is not None and s.rig.capture.frame > 0, HANG_S)
@@ -122,6 +124,7 @@ def test_what_a_check_finds_belongs_to_the_rig_that_was_checked(operator: Operat
     assert missing_facts(last_notice(after), "Checking the rig", "cancelled") == []
 
 
+@pytest.mark.slow
 def test_a_session_opens_without_the_rig_that_it_remembers(operator: Operator, tmp_path: Path) -> None:
     missing = {
         "camera": {"driver": "opencv", "source": str(tmp_path / "no.avi")},
@@ -147,6 +150,7 @@ def test_sessions_of_one_rig_have_exposures_of_their_own(operator: Operator, tmp
     assert operator.wait_for(lambda s: s.rig.exposure_ms == 3.0, HANG_S)
 
 
+@pytest.mark.slow
 def test_an_open_session_can_be_opened_again_by_any_path_and_with_another_rig(
     operator: Operator, tmp_path: Path
 ) -> None:
