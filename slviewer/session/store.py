@@ -24,7 +24,7 @@ from slviewer.session.capture import (
 from slviewer.session.decisions import Decisions
 from slviewer.session.lock import WriterLock
 from slviewer.session.names import is_safe_name, natural_key, new_name, safe_name, safe_path
-from slviewer.session.reading import decoding, expand_user
+from slviewer.session.reading import decoding
 from slviewer.session.results import check_place, check_result, list_results, read_arrays, read_meta, write_result
 from slviewer.session.trash import Trashed, list_trash, trash_place
 
@@ -89,13 +89,14 @@ class Session(Decisions):
     @classmethod
     def open_or_create(cls, path: str | Path) -> "Session":
         """The session in a folder, open for writing; made where the folder is missing or empty."""
+        before = ""
         for _ in range(5):  # attempts: another process may create or remove it meanwhile
-            was_session = layout.is_session(path)
             try:
-                return cls.open(path, write=True) if was_session else cls.create(path)
-            except SessionError:
-                if layout.is_session(path) == was_session and expand_user(path).exists():
+                return cls.open(path, write=True) if layout.is_session(path) else cls.create(path)
+            except SessionError as error:
+                if str(error) == before:
                     raise
+                before = str(error)
         return cls.create(path)
 
     def remove_if_new(self) -> None:
