@@ -2,7 +2,7 @@
 
 import shutil
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +10,7 @@ import numpy as np
 
 from slviewer.devices.capture import CapturedFrames, capture_with_texture, check_exposures
 from slviewer.devices.protocols import (
+    Camera,
     CameraSettings,
     Rig,
     list_changed_settings,
@@ -101,7 +102,7 @@ def capture(
         bench = set_up(choice, target)
         sequence = choose_sequence(bench, patterns)
         most = MAX_SUGGESTED if auto_exposure else max(1, len(exposures))
-        check_disk_space(store, bench, len(sequence.frames) * most)
+        check_space(store, bench.rig.camera, len(sequence.frames) * most, name)
         begin = 0.3 if auto_exposure else 0.0
         with bench.rig.opened() as devices:
             set_camera(devices, choice, exposure_ms, gain, warn)
@@ -207,12 +208,32 @@ def save_frames(
     )
 
 
-def check_disk_space(store: Session, bench: RigSetup, frames: int) -> None:
-    """Raise SessionError before anything is captured that the disk would refuse."""
-    (width, height), dtype = bench.rig.camera.size, bench.rig.camera.dtype
-    needed, free = frames * width * height * dtype.itemsize, shutil.disk_usage(store.folder).free
-    if free < needed:
+@dataclass(frozen=True)
+class Space:
+    """Free space on a session's disk, and what the frames to be captured need; None where that is unknown."""
+
+    free_bytes: int
+    capture_bytes: int | None
+
+    @property
+    def enough(self) -> bool:
+        """Whether twice the frames fit: what is computed from a capture takes about as much again."""
+        return self.capture_bytes is None or self.free_bytes > 2 * self.capture_bytes
+
+
+def measure_space(store: Session, camera: Camera | None, frames: int | None) -> Space:
+    """Return the free space on the session's disk, and what so many frames of a camera need."""
+    needed = None
+    if camera is not None and frames is not None:
+        needed = frames * camera.size[0] * camera.size[1] * camera.dtype.itemsize
+    return Space(shutil.disk_usage(store.folder).free, needed)
+
+
+def check_space(store: Session, camera: Camera, frames: int, name: str) -> None:
+    """Raise SessionError before anything is captured for which the disk has no room."""
+    space = measure_space(store, camera, frames)
+    if not space.enough:
         raise SessionError(
-            f"the capture needs {format_bytes(needed)} and {format_bytes(free)} are free on {store.folder}: "
-            "free some space first"
+            f"{name} needs {format_bytes(space.capture_bytes or 0)}, and as much again for its results, and "
+            f"{format_bytes(space.free_bytes)} are free on {store.folder}: free some space first"
         )

@@ -16,8 +16,8 @@ from slviewer.errors import Cancelled, DeviceError, InputError, SlviewerError, T
 from slviewer.fringe.sequence import one_axis
 from slviewer.pipeline.capture import (
     DEFAULT_PATTERNS,
-    check_disk_space,
     check_patterns,
+    check_space,
     choose_sequence,
     depth_axis,
     save_frames,
@@ -140,7 +140,7 @@ def turn(
         sequence = choose_sequence(bench, patterns)
         if (stereo := load_stereo_if_complete(store)) is not None:
             sequence = one_axis(sequence, depth_axis(stereo.rig))  # half of the frames
-        check_disk_space(store, bench, len(sequence.frames) * max(1, len(exposures)) * len(todo))
+        check_space(store, bench.rig.camera, len(sequence.frames) * max(1, len(exposures)) * len(todo), "the turn")
         with bench.rig.opened() as devices:
             set_camera(devices, choice, exposure_ms, gain, warn)
 

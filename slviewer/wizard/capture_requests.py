@@ -5,10 +5,9 @@ from dataclasses import replace
 from typing import Literal
 
 from slviewer.devices.capture import CapturedFrames
-from slviewer.errors import DeviceError, InputError, SessionError
+from slviewer.errors import DeviceError, InputError
 from slviewer.fringe.sequence import PatternSequence, one_axis
-from slviewer.pipeline.capture import choose_sequence, depth_axis, save_frames
-from slviewer.session.atomic import format_bytes
+from slviewer.pipeline.capture import check_space, choose_sequence, depth_axis, save_frames
 from slviewer.session.names import clean_label
 from slviewer.wizard.acquisition import CaptureRequest
 from slviewer.wizard.engine import Engine
@@ -124,13 +123,9 @@ class CaptureRequests(ResultRequests):
             store.decide("names", {**(store.decision("names") or {}), name: clean_label(label)})
 
     def _check_space(self, name: str, frames: int) -> None:
-        """Raise SessionError where so many frames would fill the disk."""
-        space = self._engine.space(frames)
-        if space is not None and not space.enough:
-            raise SessionError(
-                f"{name} needs {format_bytes(space.capture_bytes or 0)} and "
-                f"{format_bytes(space.free_bytes)} are free on {self._engine.store.folder}: free some space first"
-            )
+        """Raise SessionError where the disk has no room for so many frames."""
+        if self._engine.bench is not None:
+            check_space(self._engine.store, self._engine.bench.rig.camera, frames, name)
 
     def _next_name(self, kind: str) -> str:
         """Return the next unused name, such as pose_07, counting saved and queued captures."""

@@ -4,7 +4,6 @@ Requests (`operator` and the `*_requests`) call in here; panels do not. Each att
 """
 
 import contextlib
-import shutil
 import threading
 import time
 from collections.abc import Callable
@@ -19,6 +18,7 @@ from slviewer.calibration.observe import Observation, Smoothing
 from slviewer.devices.protocols import CameraSettings
 from slviewer.devices.world import SimulatedWorld
 from slviewer.errors import DamagedError, InputError, SessionError, SlviewerError
+from slviewer.pipeline.capture import measure_space
 from slviewer.pipeline.check_results import Preflight
 from slviewer.pipeline.frame_check import load_check, load_or_save_check
 from slviewer.pipeline.poses import read_stored_poses
@@ -47,7 +47,6 @@ from slviewer.wizard.snapshot import (
     RigView,
     SessionView,
     Snapshot,
-    Space,
     WorldView,
 )
 from slviewer.wizard.steps import Facts, views
@@ -243,16 +242,6 @@ class Engine:
         self.queue_processing()
         self.publisher.mark_changed(session=True)
 
-    def space(self, frames: int | None = None) -> Space | None:
-        """Return the free space on the session's disk, and what so many frames need; None without a session."""
-        store, rig = self.session, self.acquisition.view()
-        if store is None:
-            return None
-        needed = None
-        if frames is not None and rig.camera is not None and self.bench is not None:
-            needed = frames * rig.camera[0] * rig.camera[1] * self.bench.rig.camera.dtype.itemsize
-        return Space(shutil.disk_usage(store.folder).free, needed)
-
     def set_live(self, live: LiveScan) -> None:
         """Set the current live scan."""
         self.live = live
@@ -388,7 +377,9 @@ class Engine:
                 read_failure = describe_error("Reading the session", error)
         space = None
         try:
-            space = self.space(reader.count_frames(rig) if reader is not None else None)
+            if reader is not None:
+                camera = bench.rig.camera if bench is not None and rig.camera is not None else None
+                space = measure_space(reader.session, camera, reader.count_frames(rig))
         except (SlviewerError, OSError) as error:
             read_failure = read_failure or describe_error("Reading the session", error)
         if self._rig_fault:

@@ -16,6 +16,7 @@ from slviewer.devices.world import Thing
 from slviewer.evaluation.crossvalidation import CrossValidation
 from slviewer.inspection.parts import PartResult
 from slviewer.pipeline.align import Placement
+from slviewer.pipeline.capture import Space
 from slviewer.pipeline.check_results import Preflight
 from slviewer.pipeline.suggest_exposure import ExposureSuggestion
 from slviewer.registration.refusal import Reason
@@ -271,19 +272,6 @@ class StepView:
     state: StepState
     blocked_by: str
     problems: tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class Space:
-    """Free disk space, and what the next capture needs (None: unknown)."""
-
-    free_bytes: int
-    capture_bytes: int | None
-
-    @property
-    def enough(self) -> bool:
-        """Whether more than twice the space of the next capture is free; True where its need is unknown."""
-        return self.capture_bytes is None or self.free_bytes > 2 * self.capture_bytes
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 
 from slviewer.calibration.soundness import MIN_POSES
 from slviewer.evaluation.render import format_count
+from slviewer.pipeline.capture import Space
 from slviewer.pipeline.models import POSES_FOR_PIXELWISE
 from slviewer.session.atomic import format_bytes
-from slviewer.wizard.snapshot import Brightness, CalibrationView, RigView, SessionView, Space, StepState, StepView
+from slviewer.wizard.snapshot import Brightness, CalibrationView, RigView, SessionView, StepState, StepView
 
 COVERED, MANY_POSES = 0.75, 15
 """Share of the coverage's goal, or number of poses, from which on the poses are enough."""

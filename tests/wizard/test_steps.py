@@ -10,9 +10,10 @@ from slviewer.calibration.next_pose import Coverage, nominal_lens
 from slviewer.calibration.soundness import MIN_POSES
 from slviewer.calibration.stereo import StereoModel
 from slviewer.geometry.rig import StereoRig
+from slviewer.pipeline.capture import Space
 from slviewer.target.board import Board
 from slviewer.wizard.pose_plan import PlanInput, PosePlan
-from slviewer.wizard.snapshot import CalibrationView, PoseView, RigView, SessionView, Space
+from slviewer.wizard.snapshot import CalibrationView, PoseView, RigView, SessionView
 from slviewer.wizard.steps import Facts, views
 
 OPEN = RigView(state="open", name="bench", camera=(400, 300), projector=(912, 1140))
