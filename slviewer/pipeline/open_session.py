@@ -5,7 +5,8 @@ from contextlib import contextmanager
 from fnmatch import fnmatchcase
 from pathlib import Path
 
-from slviewer.errors import SlviewerError, UsageError
+from slviewer.errors import SessionError, SlviewerError, UsageError
+from slviewer.pipeline.feedback import Warn
 from slviewer.session.names import natural_key
 from slviewer.session.store import Session
 
@@ -20,6 +21,24 @@ def opened(session: SessionLike, write: bool = False) -> Iterator[Session]:
     else:
         with Session.open(session, write=write) as store:
             yield store
+
+
+@contextmanager
+def opened_to_save(session: SessionLike, warn: Warn) -> Iterator[Session]:
+    """Context manager: the session, to store results in where ``is_writable``.
+
+    One that another process is writing to, or that cannot be written, is opened for reading, with a warning.
+    """
+    if isinstance(session, Session):
+        yield session
+        return
+    try:
+        store = Session.open(session, write=True)
+    except SessionError as error:
+        store = Session.open(session)
+        warn(f"the result is not stored in the session: {error}")
+    with store:
+        yield store
 
 
 @contextmanager

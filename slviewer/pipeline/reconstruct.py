@@ -24,8 +24,8 @@ from slviewer.pipeline.models import (
     preferred_model,
     warn_if_stale,
 )
-from slviewer.pipeline.open_session import SessionLike, opened
-from slviewer.pipeline.scale import describe_scale
+from slviewer.pipeline.open_session import SessionLike, opened_to_save
+from slviewer.pipeline.scale import describe_scale, scale_factor
 from slviewer.pipeline.scan_edits import resolve_region, restrict_cloud, restriction_notes
 from slviewer.reconstruction.cloud import Cloud, choose_pixels
 from slviewer.reconstruction.mesh import triangulate_grid
@@ -109,7 +109,8 @@ def reconstruct(
     progress: Progress = ignore_progress,
     warn: Warn = ignore_warnings,
 ) -> Reconstruction:
-    """Reconstruct a capture as a cloud; for a board pose also how flat each model measures the board.
+    """Reconstruct a capture as a cloud, and store it in the session; for a board pose also how flat each model measures
+    the board.
 
     Args:
         session: Session folder.
@@ -134,7 +135,7 @@ def reconstruct(
                 f"{path}: a cloud is written as .ply (--out), its whole grid as .npy (--grid): end its name in "
                 f"{suffix}; `slviewer export` writes other formats"
             )
-    with opened(session) as store:
+    with opened_to_save(session, warn) as store:
         check_accepted(store, accept_rejected)
         name = model or preferred_model(store)
         warn_if_stale(store, warn)
@@ -184,13 +185,46 @@ def reconstruct(
         if grid is not None:
             write_grid(Path(grid), cloud.points)
         scale, fitted, frame = describe_scale(store, name), chosen[name], frame_of(store, name)
-        masked = masked_share(fitted, phases[cloud.axis], region) if isinstance(fitted, SplinedModel) else None
+        masked = masked_share(fitted, phases[cloud.axis], region)
         raised = fitted.residuals_over_noise(cloud.axis) if isinstance(fitted, SplinedModel) else 1.0
+        if store.is_writable:
+            progress(0.95, "storing")
+            save_cloud(store, capture, uncut, phases[cloud.axis], masked)
         progress(1.0, "reconstructed")
     count = int(np.count_nonzero(mask))
     return Reconstruction(
         cloud, phases, ply, count, board, scale, masked, frame, raised, None if cloud is uncut else uncut, restrictions
     )
+
+
+def save_cloud(store: Session, capture: str, cloud: Cloud, phase: PhaseMap, masked: float | None) -> None:
+    """Store a capture's cloud, before edits and region, as ``clouds/<capture>``; ``masked``: see `Reconstruction`."""
+    near, far = np.percentile(cloud.points[..., 2][cloud.mask], [1, 99])
+    meta = {
+        "model": cloud.model,
+        "axis": cloud.axis,
+        "points": int(np.count_nonzero(cloud.mask)),
+        "depth_mm": [float(near), float(far)],
+        "noise_mm": float(np.median(cloud.sigma_z[cloud.mask])),
+        "masked": masked,
+        "scale": describe_scale(store, cloud.model),
+        "scales": {cloud.model: scale_factor(store, cloud.model)},
+        "inputs": store.input_hashes(capture, *dict.fromkeys(("calibration/stereo", f"calibration/{cloud.model}"))),
+    }
+    assert cloud.texture is not None
+    arrays = {
+        "points": cloud.points,
+        "sigma_z": cloud.sigma_z,
+        "phase": phase.phase,
+        "modulation": phase.modulation,
+        "texture": cloud.texture,
+    }
+    if cloud.sigma_calibration is not None:
+        meta["sigma_calibration_mm"] = float(np.median(cloud.sigma_calibration[cloud.mask]))
+        arrays["sigma_calibration"] = cloud.sigma_calibration
+    if cloud.sigma_edges is not None:
+        arrays["sigma_edges"] = cloud.sigma_edges
+    store.save_result(f"clouds/{capture}", meta, arrays)
 
 
 def triangulate_points(points: np.ndarray, mask: np.ndarray) -> np.ndarray:
@@ -236,9 +270,11 @@ def reconstruct_models(
     return clouds
 
 
-def masked_share(model: SplinedModel, phase: PhaseMap, region: np.ndarray | None = None) -> float:
+def masked_share(model: Model, phase: PhaseMap, region: np.ndarray | None = None) -> float | None:
     """Share of the pixels (of ``region`` (h, w) bool, or of all) that could be measured and are masked, because they
-    look through parts of camera or projector that no target pose illuminated."""
+    look through parts of camera or projector that no target pose illuminated; None for models that mask none."""
+    if not isinstance(model, SplinedModel):
+        return None
     every = np.isfinite(model.points(phase, supported=False)[..., 2])
     if region is not None:
         every &= region

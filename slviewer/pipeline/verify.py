@@ -1,25 +1,39 @@
 """Measuring known shapes with each model, and comparing."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import combinations
 from typing import Any, Literal
 
 import numpy as np
 
-from slviewer.calibration.splined.model import SplinedModel
 from slviewer.errors import InputError, UsageError
 from slviewer.evaluation.compare import Comparison, compare
+from slviewer.evaluation.plane import PlaneResult
 from slviewer.evaluation.render import render
 from slviewer.evaluation.sphere import SphereResult
 from slviewer.fringe.sequence import Axis
 from slviewer.pipeline.capture_clouds import check_capture_sizes
 from slviewer.pipeline.capture_phases import capture_texture, decode_captures
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
-from slviewer.pipeline.models import ModelName, check_accepted, load_models, load_stereo, warn_if_stale
-from slviewer.pipeline.open_session import SessionLike, opened
-from slviewer.pipeline.reconstruct import illuminated_pixels, masked_share, reconstruct_models, segment_board
-from slviewer.pipeline.scale import describe_scale
+from slviewer.pipeline.models import (
+    ModelName,
+    check_accepted,
+    load_models,
+    load_stereo,
+    preferred_model,
+    warn_if_stale,
+)
+from slviewer.pipeline.open_session import SessionLike, opened_to_save
+from slviewer.pipeline.reconstruct import (
+    illuminated_pixels,
+    masked_share,
+    reconstruct_models,
+    save_cloud,
+    segment_board,
+)
+from slviewer.pipeline.scale import describe_scale, scale_factor
+from slviewer.session.store import Session
 
 Shape = Literal["plane", "sphere"]
 
@@ -92,6 +106,8 @@ def verify(
 ) -> Verification:
     """Measure captures of a plane or a sphere with each model, over the pixels that all of them measure, and compare.
 
+    The session stores the figures, the error maps, and the cloud of the model that it prefers.
+
     Args:
         session: Session folder.
         captures: Names of the captures.
@@ -112,7 +128,7 @@ def verify(
         raise UsageError(f"a radius of {radius:g} mm is not possible: give a positive one")
     results: dict[str, Comparison] = {}
     masked: dict[str, dict[str, float]] = {}
-    with opened(session) as store:
+    with opened_to_save(session, warn) as store:
         check_accepted(store, accept_rejected)
         chosen = load_models(store, models)
         warn_if_stale(store, warn)
@@ -135,10 +151,33 @@ def verify(
             results[shot.name] = result
             axis_used = next(iter(clouds.values())).axis
             masked[shot.name] = {
-                name: masked_share(model, phases[axis_used], result.region)
+                name: share
                 for name, model in chosen.items()
-                if isinstance(model, SplinedModel)
+                if (share := masked_share(model, phases[axis_used], result.region)) is not None
             }
+            if store.is_writable:
+                _save_verification(store, shot.name, result, masked[shot.name])
+                best = preferred_model(store)
+                cloud = clouds.get(best) or next(reversed(clouds.values()))
+                cloud = replace(cloud, texture=capture_texture(shot, frames, stretch=shot.role == "calibration"))
+                share = masked_share(chosen[cloud.model], phases[axis_used], region)
+                save_cloud(store, shot.name, cloud, phases[axis_used], share)
         scales = {name: words for name in chosen if (words := describe_scale(store, name))}
         progress(1.0, "measured")
     return Verification(results, masked, scales)
+
+
+def _save_verification(store: Session, capture: str, found: Comparison, masked: Mapping[str, float]) -> None:
+    """Store how far a capture is from its shape as ``verify/<capture>``, with the error map (h, w) mm of each model."""
+    models = tuple(found.results)
+    meta = {
+        **found.to_json(),
+        "centres_mm": {m: r.sphere.centre for m, r in found.results.items() if isinstance(r, SphereResult)},
+        "masked": dict(masked),
+        "scales": {model: scale_factor(store, model) for model in models},
+        "normals": {m: r.plane.normal for m, r in found.results.items() if isinstance(r, PlaneResult)},
+        "inputs": store.input_hashes(capture, *(f"calibration/{model}" for model in models)),
+    }
+    store.save_result(
+        f"verify/{capture}", meta, {f"error_{m}": result.error_map for m, result in found.results.items()}
+    )

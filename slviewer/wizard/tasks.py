@@ -2,8 +2,8 @@
 
 =====================  ============================================================================================
 `poses/<capture>`      the features of a target pose (`pipeline.poses`)
-`clouds/<capture>`     the organised cloud, with phase and modulation at each pixel
-`verify/<capture>`     error maps and figures of a plane or a sphere, model by model
+`clouds/<capture>`     the organised cloud, with phase and modulation at each pixel (`pipeline.reconstruct`)
+`verify/<capture>`     error maps and figures of a plane or a sphere, model by model (`pipeline.verify`)
 `placement/<capture>`  where a scan is among those that are aligned as they come
 `merge/<number>`       the alignment of scans; the points are in `exports/merged_<number>.ply`
 =====================  ============================================================================================
@@ -14,12 +14,8 @@ by a job of their own (`engine`), which no cloud waits for.
 
 from functools import partial
 
-import numpy as np
-
 from slviewer.errors import Cancelled, InputError, SlviewerError
 from slviewer.evaluation.crossvalidation import CrossValidation
-from slviewer.evaluation.plane import PlaneResult
-from slviewer.evaluation.sphere import SphereResult
 from slviewer.pipeline.align import Placement, align_scan, list_scans, load_placement
 from slviewer.pipeline.calibrate import CalibrationResult, calibrate
 from slviewer.pipeline.edit import SUPPORT, Selection, delete_points
@@ -28,10 +24,9 @@ from slviewer.pipeline.merge import Merge, Picked, StartKind, merge, merge_recor
 from slviewer.pipeline.models import POSES_FOR_PIXELWISE, accepts_rejected, available_models, best_model
 from slviewer.pipeline.open_session import next_number, numbered_results
 from slviewer.pipeline.reconstruct import reconstruct
-from slviewer.pipeline.scale import scale_factor
 from slviewer.pipeline.turn import WATERTIGHT, align_turn
 from slviewer.pipeline.validate import validate
-from slviewer.pipeline.verify import Shape, verify
+from slviewer.pipeline.verify import Shape, Verification, verify
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.session.scan_edits import load_edits
 from slviewer.session.store import Session
@@ -89,90 +84,34 @@ def describe_comparison(compared: CrossValidation) -> str:
 
 
 def reconstruct_capture(session: Session, name: str, model: str | None, report: Reporter, warn: Warn) -> int:
-    """Reconstruct a capture, save its cloud, and write its PLY into the exports; returns the number of points."""
+    """Reconstruct a capture, with its PLY in the exports; returns the number of points."""
     accepts = accepts_rejected(session)
     model = model or best_model(session, accepts)
     with staged_export(session, f"{name}_{model}.ply", report) as ply:
-        progress = report.within(0, 0.9)
         made = reconstruct(
-            session, name, model=model, out=ply, accept_rejected=accepts, check=False, progress=progress, warn=warn
-        )
-        cloud, phase = made.uncut or made.cloud, made.phases[made.cloud.axis]  # edits apply to what is read
-        z = cloud.points[..., 2][cloud.mask]
-        near, far = np.percentile(z, [1, 99])
-        calibrations = dict.fromkeys(("calibration/stereo", f"calibration/{model}"))
-        meta = {
-            "model": model,
-            "axis": cloud.axis,
-            "points": int(np.count_nonzero(cloud.mask)),
-            "depth_mm": [float(near), float(far)],
-            "noise_mm": float(np.median(cloud.sigma_z[cloud.mask])),
-            "masked": made.masked,
-            "scale": made.scale,
-            "scales": {model: scale_factor(session, model)},
-            "inputs": session.input_hashes(name, *calibrations),
-        }
-        assert cloud.texture is not None
-        arrays = {
-            "points": cloud.points,
-            "sigma_z": cloud.sigma_z,
-            "phase": phase.phase,
-            "modulation": phase.modulation,
-            "texture": cloud.texture,
-        }
-        if cloud.sigma_calibration is not None:
-            meta["sigma_calibration_mm"] = float(np.median(cloud.sigma_calibration[cloud.mask]))
-            arrays["sigma_calibration"] = cloud.sigma_calibration
-        if cloud.sigma_edges is not None:
-            arrays["sigma_edges"] = cloud.sigma_edges
-        report(0.95, "saving")
-        session.guarded(report.saving).save_result(f"clouds/{name}", meta, arrays)
+            session.guarded(report.saving), name, model=model, out=ply, accept_rejected=accepts, check=False,
+            progress=report.within(0, 0.98), warn=warn,
+        )  # fmt: skip
     report(1.0, "reconstructed")
     return made.points
 
 
 def verify_captures(
     session: Session, names: list[str], shape: Shape, radius: float | None, report: Reporter, warn: Warn
-) -> dict[str, dict[str, float]]:
-    """Compare the models on captures of a plane or a sphere, and save error maps and clouds.
-
-    Returns {capture: {model: RMS mm}}.
-    """
-    rms = {}
-    for i, name in enumerate(names):
-        span = report.within(i / len(names), (i + 1) / len(names))
-        measured = verify(
-            session,
-            [name],
-            shape,
-            radius=radius,
-            accept_rejected=accepts_rejected(session),
-            check=False,
-            progress=span.within(0, 0.5),
-            warn=warn,
-        )
-        result = measured.captures[name]
-        models = available_models(session)
-        meta = {
-            **result.to_json(),
-            "centres_mm": {m: r.sphere.centre for m, r in result.results.items() if isinstance(r, SphereResult)},
-            "masked": dict(measured.masked[name]),
-            "scales": {model: scale_factor(session, model) for model in models},
-            "normals": {m: r.plane.normal for m, r in result.results.items() if isinstance(r, PlaneResult)},
-            "inputs": session.input_hashes(name, *(f"calibration/{model}" for model in models)),
-        }
-        arrays = {f"error_{model}": result.error_map for model, result in result.results.items()}
-        span(0.5, "saving")
-        session.guarded(report.saving).save_result(f"verify/{name}", meta, arrays)
-        reconstruct_capture(session, name, None, span.within(0.5, 1), warn)
-        rms[name] = {model: result.rms_mm for model, result in result.results.items()}
-    report(1.0, "measured")
-    return rms
+) -> Verification:
+    """Compare the models on captures of a plane or a sphere; each is stored before the next is measured."""
+    guarded, accepts = session.guarded(report.saving), accepts_rejected(session)
+    return verify(
+        guarded, names, shape, radius=radius, accept_rejected=accepts, check=False, progress=report, warn=warn
+    )
 
 
-def describe_verifications(rms: dict[str, dict[str, float]]) -> str:
+def describe_verifications(found: Verification) -> str:
     """Describe verifications in one sentence: the RMS mm of each model on each capture."""
-    figures = {name: ", ".join(f"{m} {mm:.3f} mm" for m, mm in models.items()) for name, models in rms.items()}
+    figures = {
+        name: ", ".join(f"{model} {result.rms_mm:.3f} mm" for model, result in compared.results.items())
+        for name, compared in found.captures.items()
+    }
     return "; ".join(f"{name}: RMS {text}" for name, text in figures.items())
 
 

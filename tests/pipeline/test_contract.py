@@ -1,0 +1,154 @@
+"""One operation, one record: the terminal, Python and the wizard store the same results of the same session."""
+
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import slviewer as sl
+from slviewer.cli import main
+from slviewer.pipeline.certificate import make_certificate
+from slviewer.session.store import Session
+from slviewer.wizard.operator import Operator
+
+HANG_S = 600.0
+
+
+@dataclass(frozen=True)
+class Operation:
+    """An operation in the words of the terminal, of Python and of the wizard, and the results that it stores."""
+
+    terminal: tuple[str, ...]
+    python: Callable[[Path], object]
+    wizard: Callable[[Operator], bool]
+    stored: tuple[str, ...]
+    capture: str
+
+
+OPERATIONS = {
+    "reconstruct": Operation(
+        ("reconstruct", "SESSION", "object_r1"),
+        lambda session: sl.reconstruct(session, "object_r1"),
+        lambda operator: operator.reconstruct("object_r1"),
+        ("clouds/object_r1",),
+        "object_r1",
+    ),
+    "verify": Operation(
+        ("verify", "SESSION", "plane_03", "--shape", "plane"),
+        lambda session: sl.verify(session, ["plane_03"], "plane"),
+        lambda operator: operator.verify(["plane_03"], "plane"),
+        ("verify/plane_03", "clouds/plane_03"),
+        "plane_03",
+    ),
+    "merge": Operation(
+        ("merge", "SESSION", "object_r1", "object_r2", "--reference", "object_r2"),
+        lambda session: sl.merge(session, ["object_r1", "object_r2"], "object_r2"),
+        lambda operator: operator.merge(["object_r1", "object_r2"], "object_r2"),
+        ("merge/1",),
+        "object_r1",
+    ),
+}
+
+
+def by_terminal(operation: Operation, session: Path) -> None:
+    assert main([str(session) if word == "SESSION" else word for word in operation.terminal]) == 0
+
+
+def by_python(operation: Operation, session: Path) -> None:
+    operation.python(session)
+
+
+def by_wizard(operation: Operation, session: Path) -> None:
+    with Operator(session) as operator:
+        assert operation.wizard(operator)
+        operator.wait_until_idle(HANG_S)
+        assert [notice.text for notice in operator.snapshot().notices if notice.level == "error"] == []
+
+
+DOORS = {"terminal": by_terminal, "python": by_python, "wizard": by_wizard}
+
+
+def records(session: Path, names: tuple[str, ...]) -> dict[str, tuple[dict[str, Any], dict[str, np.ndarray]]]:
+    with Session.open(session) as store:
+        assert {store.state_of(name) for name in names} == {"fresh"}
+        return {name: store.load_result(name) for name in names}
+
+
+@pytest.fixture(scope="module", params=OPERATIONS)
+def done(
+    request: pytest.FixtureRequest, recorded: Path, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Operation, dict[str, Path]]:
+    """An operation, and a session for each door by which it was asked for; all were equal before."""
+    folder, operation = tmp_path_factory.mktemp("contract"), OPERATIONS[request.param]
+    sessions = {door: shutil.copytree(recorded / "session", folder / door) for door in DOORS}
+    for door, session in sessions.items():
+        DOORS[door](operation, session)
+    return operation, sessions
+
+
+def assert_same(found: Any, wanted: Any, place: str) -> None:
+    """Assert that values of a record are the same; ICP sums in parallel, so that its last digits vary."""
+    assert type(found) is type(wanted), place
+    if isinstance(wanted, dict):
+        assert found.keys() == wanted.keys(), place
+        for key in wanted:
+            assert_same(found[key], wanted[key], f"{place}.{key}")
+    elif isinstance(wanted, list):
+        assert len(found) == len(wanted), place
+        for k, each in enumerate(wanted):
+            assert_same(found[k], each, f"{place}[{k}]")
+    elif isinstance(wanted, float):
+        assert found == pytest.approx(wanted, rel=1e-3, abs=1e-5), place
+    else:
+        assert found == wanted, place
+
+
+def test_every_door_stores_the_same_record(done: tuple[Operation, dict[str, Path]]) -> None:
+    operation, sessions = done
+    terminal, *others = (records(session, operation.stored) for session in sessions.values())
+    for other in others:
+        for name, (meta, arrays) in terminal.items():
+            own = ("hash",) if name.startswith("merge/") else ()  # of those digits
+            assert_same(*({k: v for k, v in each.items() if k not in own} for each in (other[name][0], meta)), name)
+            assert arrays.keys() == other[name][1].keys()
+            for key, array in arrays.items():
+                np.testing.assert_array_equal(array, other[name][1][key], f"{name}, {key}")
+
+
+def test_what_the_terminal_made_is_done_in_the_wizard_and_certified(done: tuple[Operation, dict[str, Path]]) -> None:
+    operation, sessions = done
+    with Operator(sessions["terminal"]) as operator:
+        view = operator.wait_until_idle(HANG_S).session
+        assert view is not None
+        shown = {f"verify/{each.capture}" for each in view.verifications if not each.stale}
+        shown |= {f"clouds/{each.name}" for each in view.scans if each.cloud == "fresh"}
+        shown |= {f"merge/{view.merge.name}"} if view.merge is not None and not view.merge.stale else set()
+        assert set(operation.stored) <= shown
+    with Session.open(sessions["terminal"]) as store:
+        certificate = make_certificate(store)
+    assert set(operation.stored) <= set(certificate.results)
+    assert {name for name in operation.stored if name.startswith("verify/")} <= set(certificate.figures)
+
+
+def test_a_changed_capture_makes_the_record_stale(done: tuple[Operation, dict[str, Path]], tmp_path: Path) -> None:
+    operation, sessions = done
+    folder = shutil.copytree(sessions["python"], tmp_path / "session")
+    with Session.open(folder, write=True) as store:
+        capture = store.load_capture(operation.capture)
+        frames = np.maximum(capture.frames, 1)
+        store.save_capture(operation.capture, "scan", capture.sequence, frames, source="simulated", force=True)
+        assert {store.state_of(name) for name in operation.stored} == {"stale"}
+
+
+def test_a_session_in_use_is_read_and_the_result_is_not_stored(recorded: Path, tmp_path: Path) -> None:
+    session, warnings = shutil.copytree(recorded / "session", tmp_path / "session"), list[str]()
+    with Session.open(session, write=True) as store:
+        made = sl.reconstruct(session, "object_r1", out=tmp_path / "cloud.ply", warn=warnings.append)
+        assert made.points > 10_000 and made.ply.is_file()
+        assert store.state_of("clouds/object_r1") == "absent"
+    (warning,) = warnings
+    assert "not stored" in warning and str(session) in warning
