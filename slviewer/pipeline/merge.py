@@ -16,7 +16,7 @@ from slviewer.pipeline.capture_clouds import capture_cloud, check_capture_sizes
 from slviewer.pipeline.capture_phases import capture_texture, decode_captures
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings, stage
 from slviewer.pipeline.models import ModelName, check_accepted, frame_of, load_model, preferred_model, warn_if_stale
-from slviewer.pipeline.open_session import SessionLike, next_number, opened
+from slviewer.pipeline.open_session import SessionLike, next_number, opened, placed_file
 from slviewer.pipeline.scale import describe_scale, scale_factor
 from slviewer.pipeline.scan_edits import resolve_region, restrict_cloud, restriction_notes
 from slviewer.reconstruction.cloud import Cloud
@@ -214,7 +214,6 @@ def merge(
         out = Path(out)
         if out.suffix.lower() != ".ply":
             raise UsageError(f"merged points are written as .ply, not as {out.name}: a mesh goes into other files too")
-        out.parent.mkdir(parents=True, exist_ok=True)
     if angle is not None and start != "turntable":
         raise UsageError("an angle from scan to scan is that of a turntable: give --start turntable too, or neither")
     table_deg = None if angle is None else {name: angle * k for k, name in enumerate(names)}
@@ -266,18 +265,16 @@ def merge(
         scalars |= {"seen_by": fused.seen_by, "source": fused.source}
         frame = f"{frame_of(store, fitted.name)}, at {reference}"
         notes = (f"scans {', '.join(names)}, frame: {frame}", f"calibration {fitted.name}", *restrictions)
-        number = 0 if out is not None else next_number(store, "merge")
-        path = store.exports / f"merged_{number}.ply" if out is None else out
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_ply(path, surface.points, surface.colours, surface.normals, scalars, notes=notes)
         static_points = {name: int(mask.sum()) for name, mask in registered.static.items()}
-        result_name = f"merge/{number}" if number else ""
-        result = Merge(
-            alignment, fused, clouds, path, scale, result_name, static_points, registered.contradictions,
-            restrictions, inputs,
-        )  # fmt: skip
-        if result.result_name:
-            store.save_result(result.result_name, merge_record(store, result, fitted.name), {})
+        number = 0 if out is not None else next_number(store, "merge")
+        with placed_file(store, out, f"merged_{number}.ply") as (path, written):
+            write_ply(written, surface.points, surface.colours, surface.normals, scalars, notes=notes)
+            result = Merge(
+                alignment, fused, clouds, path, scale, f"merge/{number}" if number else "", static_points,
+                registered.contradictions, restrictions, inputs,
+            )  # fmt: skip
+            if result.result_name:
+                store.save_result(result.result_name, _make_record(store, result, fitted.name), {})
     progress(1.0, "merged")
     return result
 
@@ -363,7 +360,7 @@ def _scene_warnings(clouds: Mapping[str, Cloud], registered: ObjectAlignment, ke
     return messages
 
 
-def merge_record(store: Session, merged: Merge, model: str) -> dict[str, Any]:
+def _make_record(store: Session, merged: Merge, model: str) -> dict[str, Any]:
     """Return the stored record of a merge made with that model: its figures, its file in the exports, and its
     inputs."""
     calibrations = dict.fromkeys(("calibration/stereo", f"calibration/{model}"))

@@ -42,6 +42,20 @@ def opened_to_save(session: SessionLike, warn: Warn) -> Iterator[Session]:
 
 
 @contextmanager
+def placed_file(store: Session, out: Path | str | None, name: str) -> Iterator[tuple[Path, Path]]:
+    """Context manager: the file ``out``, or one of this name in the session's exports, and the path to write it to.
+
+    In the exports it appears at the end of the block, unless that fails.
+    """
+    if out is not None:
+        Path(out).parent.mkdir(parents=True, exist_ok=True)
+        yield Path(out), Path(out)
+        return
+    with store.staged_export(name) as staged:
+        yield store.exports / name, staged
+
+
+@contextmanager
 def opened_or_made(session: SessionLike) -> Iterator[Session]:
     """Context manager: the session, open for writing; one created for the block is removed again if nothing was saved
     in it."""

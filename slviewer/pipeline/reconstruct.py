@@ -24,7 +24,7 @@ from slviewer.pipeline.models import (
     preferred_model,
     warn_if_stale,
 )
-from slviewer.pipeline.open_session import SessionLike, opened_to_save
+from slviewer.pipeline.open_session import SessionLike, opened_to_save, placed_file
 from slviewer.pipeline.scale import describe_scale, scale_factor
 from slviewer.pipeline.scan_edits import resolve_region, restrict_cloud, restriction_notes
 from slviewer.reconstruction.cloud import Cloud, choose_pixels
@@ -168,28 +168,27 @@ def reconstruct(
                 f"{capture}: no pixel could be reconstructed with {name}: does the calibration belong to this camera "
                 "and projector, and is the scene within its depths?"
             )
-        ply = Path(out) if out is not None else store.exports / f"{capture}_{name}{'_mesh' if mesh else ''}.ply"
         progress(0.8, "writing")
-        ply.parent.mkdir(parents=True, exist_ok=True)
         faces = triangulate_points(cloud.points, mask) if mesh else None
         notes = (f"scan {capture}, frame: {frame_of(store, name)}", f"calibration {name}", *restrictions)
-        write_ply(
-            ply,
-            choose_pixels(cloud.points, mask),
-            texture[mask],
-            normals(cloud.points)[mask],
-            cloud.sigmas(mask),
-            faces,
-            notes,
-        )
-        if grid is not None:
-            write_grid(Path(grid), cloud.points)
         scale, fitted, frame = describe_scale(store, name), chosen[name], frame_of(store, name)
         masked = masked_share(fitted, phases[cloud.axis], region)
         raised = fitted.residuals_over_noise(cloud.axis) if isinstance(fitted, SplinedModel) else 1.0
-        if store.is_writable:
-            progress(0.95, "storing")
-            save_cloud(store, capture, uncut, phases[cloud.axis], masked)
+        with placed_file(store, out, f"{capture}_{name}{'_mesh' if mesh else ''}.ply") as (ply, written):
+            write_ply(
+                written,
+                choose_pixels(cloud.points, mask),
+                texture[mask],
+                normals(cloud.points)[mask],
+                cloud.sigmas(mask),
+                faces,
+                notes,
+            )
+            if grid is not None:
+                write_grid(Path(grid), cloud.points)
+            if store.is_writable:
+                progress(0.95, "storing")
+                save_cloud(store, capture, uncut, phases[cloud.axis], masked)
         progress(1.0, "reconstructed")
     count = int(np.count_nonzero(mask))
     return Reconstruction(

@@ -16,7 +16,8 @@ import msgspec
 
 from slviewer.errors import DamagedError, InputError
 from slviewer.records import from_plain
-from slviewer.session.atomic import replace_json
+from slviewer.session.atomic import replace_file, replace_json
+from slviewer.session.names import natural_key, new_name
 from slviewer.session.reading import read_json
 
 _Exposure = Annotated[float, msgspec.Meta(gt=0, lt=1e9)]
@@ -110,6 +111,18 @@ class Decisions:
         path = self.folder / "decisions.json"
         with self._decisions_lock:
             replace_json(path, {**_read_all(path)[0], what: make()})
+
+    def save_rig(self, name: str, text: str) -> Path:
+        """Keep the operator's own rig, TOML, in place of one of that name; returns its file."""
+        self._require_writer()
+        path = self.folder / "rigs" / f"{new_name(name, self.rigs())}.toml"
+        replace_file(path, text.encode())
+        return path
+
+    def rigs(self) -> dict[str, Path]:
+        """The files of the operator's own rigs by name."""
+        files = sorted((self.folder / "rigs").glob("[!.]*.toml"), key=lambda path: natural_key(path.stem))
+        return {path.stem: path for path in files}
 
     def _require_writer(self) -> None:
         """Raise SessionError unless writing is allowed."""

@@ -416,18 +416,6 @@ class Session(Decisions):
         self.load_capture(name)
         self._decide("excluded", lambda: {**self.excluded(), name: why})
 
-    def save_rig(self, name: str, text: str) -> Path:
-        """Keep the operator's own rig, TOML, in place of one of that name; returns its file."""
-        self._require_writer()
-        path = self.folder / "rigs" / f"{new_name(name, self.rigs())}.toml"
-        atomic.replace_file(path, text.encode())
-        return path
-
-    def rigs(self) -> dict[str, Path]:
-        """The files of the operator's own rigs by name."""
-        files = sorted((self.folder / "rigs").glob("[!.]*.toml"), key=lambda path: natural_key(path.stem))
-        return {path.stem: path for path in files}
-
     @property
     def exports(self) -> Path:
         """The folder of exported files, created where it is missing."""
@@ -435,6 +423,17 @@ class Session(Decisions):
         with atomic.disk_errors(self.folder):
             folder.mkdir(exist_ok=True)
         return folder
+
+    @contextmanager
+    def staged_export(self, name: str) -> Iterator[Path]:
+        """Context manager: a path for a file that goes to the exports at the end, unless that fails or is given up."""
+        target = self.exports / safe_name(name)
+        with atomic.staged_folder(target, 0) as folder:
+            yield folder / name
+            if self._allow is not None:
+                self._allow()
+            atomic.rename(folder / name, target)
+        atomic.discard(folder)
 
     # inside
 

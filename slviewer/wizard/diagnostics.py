@@ -23,7 +23,6 @@ from slviewer.errors import SessionError, hide_passwords
 from slviewer.session.atomic import to_json
 from slviewer.session.reading import MAX_JSON_BYTES, read_file
 from slviewer.session.store import Session
-from slviewer.wizard.export_files import staged_export
 from slviewer.wizard.jobs import Reporter
 from slviewer.wizard.snapshot import PreviewView, Snapshot
 
@@ -58,7 +57,8 @@ def write_bundle(
 ) -> str:
     """Write ``diagnostics_<time>.zip`` into the exports; returns its name."""
     name = f"diagnostics_{datetime.now():%Y%m%d_%H%M%S}.zip"
-    with staged_export(session, name, report) as path, zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as bundle:
+    guarded = session.guarded(report.saving)
+    with guarded.staged_export(name) as path, zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as bundle:
         report(0.1, "versions and settings")
         bundle.writestr("versions.json", to_json(_collect_versions()))
         bundle.writestr("state.json", hide_passwords(to_json(_summarise_state(snapshot)).decode()))

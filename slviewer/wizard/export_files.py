@@ -1,31 +1,13 @@
 """Files for other programs, made in the session's `exports` folder."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-from pathlib import Path
-
 from slviewer.pipeline.export import What, default_file_name, export
 from slviewer.pipeline.feedback import Warn
 from slviewer.pipeline.mesh import MERGE, mesh
 from slviewer.pipeline.models import accepts_rejected
-from slviewer.session import atomic
-from slviewer.session.atomic import rename
-from slviewer.session.names import safe_name
 from slviewer.session.store import Session
 from slviewer.surface.meshing import MeshingPlan
 from slviewer.wizard.jobs import Reporter
 from slviewer.wizard.snapshot import ExportView
-
-
-@contextmanager
-def staged_export(session: Session, name: str, report: Reporter) -> Iterator[Path]:
-    """Yield a temporary path for `name`; at the end the file is moved to the exports, unless the work was cancelled."""
-    target = session.exports / safe_name(name)
-    with atomic.staged_folder(target, 0) as folder:
-        yield folder / name
-        report.saving()
-        rename(folder / name, target)
-    atomic.discard(folder)
 
 
 def export_file(
@@ -45,7 +27,7 @@ def export_file(
     """
     accepts, progress = accepts_rejected(session), report.within(0, 0.98)
     if texture is None:
-        with staged_export(session, default_file_name(what, name, file_format), report) as path:
+        with session.guarded(report.saving).staged_export(default_file_name(what, name, file_format)) as path:
             exported = export(
                 session, what, name, out=path, plan=plan, accept_rejected=accepts, progress=progress, warn=warn
             )

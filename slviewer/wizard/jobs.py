@@ -5,7 +5,7 @@ raises Cancelled. Work that is inside a call that cannot be interrupted (OpenCV,
 `PATIENCE_S`: the worker goes on with the next job, and the abandoned thread ends at its next report.
 
 Abandoned work never saves anything afterwards: jobs get the session as `session.guarded(reporter.saving)`, and write
-exports through `export_files.staged_export`; both call `saving` right before a save takes effect. Conversely, work that
+exports through its `staged_export`; both call `saving` right before a save takes effect. Conversely, work that
 has begun to save is no longer cancelled but awaited, so that a calibration of two models is never half saved.
 `done(result)` runs on the worker if the job was not cancelled.
 """

@@ -22,7 +22,6 @@ from slviewer.session.measurements import Measurement
 from slviewer.session.names import safe_name
 from slviewer.session.nominal import NOMINALS, Units, read_nominal
 from slviewer.session.store import Session
-from slviewer.wizard.export_files import staged_export
 from slviewer.wizard.jobs import Reporter
 from slviewer.wizard.requests import RequestHandler, request
 from slviewer.wizard.surfaces import Surfaces
@@ -168,7 +167,7 @@ class MeasureRequests(RequestHandler):
             report(0.0, f"reading {nominal}")
             ideal, surface = read_nominal(path, units), self._surfaces.load(store, on)
             name = f"{on.replace('/', '_')}_{path.stem}_deviation.ply"
-            with staged_export(store, name, report) as ply, _reword_errors():
+            with store.guarded(report.saving).staged_export(name) as ply, _reword_errors():
                 result = compare_surface(
                     store.guarded(report.saving),
                     surface,
@@ -207,7 +206,7 @@ class MeasureRequests(RequestHandler):
 
         def work(report: Reporter) -> str:
             """Write the CSV into the exports; returns a sentence with the number of measurements."""
-            with staged_export(store, TABLE, report) as path:
+            with store.guarded(report.saving).staged_export(TABLE) as path:
                 count = measurements.export_measurements(store, path)
             report(1.0, "written")
             return f"{TABLE} is ready to download: {count} measurement{'s' * (count != 1)}"
@@ -222,7 +221,7 @@ class MeasureRequests(RequestHandler):
         def work(report: Reporter) -> str:
             """Write the plan into the exports; returns a sentence with what to do with it."""
             made = make_plan(store, TOLERANCE_MM, name=store.folder.name, warn=self._warner("measurements"))
-            with staged_export(store, PLAN, report) as path:
+            with store.guarded(report.saving).staged_export(PLAN) as path:
                 write_plan(made, path)
             report(1.0, "written")
             return (

@@ -20,9 +20,9 @@ from slviewer.pipeline.align import Placement, align_scan, list_scans, load_plac
 from slviewer.pipeline.calibrate import CalibrationResult, calibrate
 from slviewer.pipeline.edit import SUPPORT, Selection, delete_points
 from slviewer.pipeline.feedback import Warn
-from slviewer.pipeline.merge import Merge, Picked, StartKind, merge, merge_record
-from slviewer.pipeline.models import POSES_FOR_PIXELWISE, accepts_rejected, available_models, best_model
-from slviewer.pipeline.open_session import next_number, numbered_results
+from slviewer.pipeline.merge import Merge, Picked, StartKind, merge
+from slviewer.pipeline.models import POSES_FOR_PIXELWISE, accepts_rejected, available_models
+from slviewer.pipeline.open_session import numbered_results
 from slviewer.pipeline.reconstruct import reconstruct
 from slviewer.pipeline.turn import WATERTIGHT, align_turn
 from slviewer.pipeline.validate import validate
@@ -31,7 +31,7 @@ from slviewer.reconstruction.cloud import Cloud
 from slviewer.session.scan_edits import load_edits
 from slviewer.session.store import Session
 from slviewer.surface.selection import select_support
-from slviewer.wizard.export_files import export_file, staged_export
+from slviewer.wizard.export_files import export_file
 from slviewer.wizard.jobs import Reporter
 from slviewer.wizard.result_views import used_points, whole_cloud
 from slviewer.wizard.snapshot import Level
@@ -85,14 +85,8 @@ def describe_comparison(compared: CrossValidation) -> str:
 
 def reconstruct_capture(session: Session, name: str, model: str | None, report: Reporter, warn: Warn) -> int:
     """Reconstruct a capture, with its PLY in the exports; returns the number of points."""
-    accepts = accepts_rejected(session)
-    model = model or best_model(session, accepts)
-    with staged_export(session, f"{name}_{model}.ply", report) as ply:
-        made = reconstruct(
-            session.guarded(report.saving), name, model=model, out=ply, accept_rejected=accepts, check=False,
-            progress=report.within(0, 0.98), warn=warn,
-        )  # fmt: skip
-    report(1.0, "reconstructed")
+    guarded, accepts = session.guarded(report.saving), accepts_rejected(session)
+    made = reconstruct(guarded, name, model=model, accept_rejected=accepts, check=False, progress=report, warn=warn)
     return made.points
 
 
@@ -171,18 +165,11 @@ def merge_scans(
     angle: float | None = None,
     picked: Picked | None = None,
 ) -> Merge:
-    """Register scans to a reference, save the alignment, and write the merged PLY into the exports."""
-    number = next_number(session, "merge")
-    accepts = accepts_rejected(session)
-    model = best_model(session, accepts)
-    with staged_export(session, f"merged_{number}.ply", report) as ply:
-        result = merge(
-            session, names, reference, ply, model=model, start=start, angle=angle, picked=picked,
-            accept_rejected=accepts, progress=report.within(0, 0.97), warn=warn,
-        )  # fmt: skip
-        session.guarded(report.saving).save_result(f"merge/{number}", merge_record(session, result, model), {})
-    report(1.0, "merged")
-    return result
+    """Register scans to a reference, with the merged PLY in the exports."""
+    return merge(
+        session.guarded(report.saving), names, reference, start=start, angle=angle, picked=picked,
+        accept_rejected=accepts_rejected(session), progress=report, warn=warn,
+    )  # fmt: skip
 
 
 def merge_turn(session: Session, names: list[str], report: Reporter, warn: Warn) -> tuple[Merge, str]:
