@@ -115,7 +115,7 @@ def reconstruct(
     Args:
         session: Session folder.
         capture: Name of the capture.
-        model: Which calibration to use; by default the best one available.
+        model: Which calibration to use, here and by what then works on this cloud; by default the best one available.
         axis: Which pattern axis gives the depth; by default the one with the smaller predicted noise.
         depth_range: For patterns that do not cover the projector: near and far end, mm, of the depths between which
             all surfaces lie; by default the calibrated depths.

@@ -106,7 +106,7 @@ def verify(
 ) -> Verification:
     """Measure captures of a plane or a sphere with each model, over the pixels that all of them measure, and compare.
 
-    The session stores the figures, the error maps, and the cloud of the model that it prefers.
+    The session stores the figures, the error maps, and the cloud of the model that it prefers, if that is compared.
 
     Args:
         session: Session folder.
@@ -157,11 +157,10 @@ def verify(
             }
             if store.is_writable:
                 _save_verification(store, shot.name, result, masked[shot.name])
-                best = preferred_model(store)
-                cloud = clouds.get(best) or next(reversed(clouds.values()))
-                cloud = replace(cloud, texture=capture_texture(shot, frames, stretch=shot.role == "calibration"))
-                share = masked_share(chosen[cloud.model], phases[axis_used], region)
-                save_cloud(store, shot.name, cloud, phases[axis_used], share)
+                if (best := preferred_model(store)) in clouds:
+                    texture = capture_texture(shot, frames, stretch=shot.role == "calibration")
+                    share = masked_share(chosen[best], phases[axis_used], region)
+                    save_cloud(store, shot.name, replace(clouds[best], texture=texture), phases[axis_used], share)
         scales = {name: words for name in chosen if (words := describe_scale(store, name))}
         progress(1.0, "measured")
     return Verification(results, masked, scales)
