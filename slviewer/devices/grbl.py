@@ -74,7 +74,7 @@ _BLOCKED = {
 
 
 @dataclass(frozen=True)
-class Timing:
+class ControllerTiming:
     """How a controller is waited for: how often it is asked for its state, how long it must be silent until everything
     that it had to say has been read, in s, and the clock.
     """
@@ -84,7 +84,7 @@ class Timing:
     clock: Callable[[], float] = time.monotonic
 
 
-TIMING = Timing()
+TIMING = ControllerTiming()
 """For real controllers."""
 
 
@@ -105,7 +105,7 @@ class GcodeTurntable(Openable):
         limits_deg: Sequence[float] | None = None,
         boot_s: Positive = BOOT_S,
         reply_s: Positive = REPLY_S,
-        timing: Timing = TIMING,
+        timing: ControllerTiming = TIMING,
     ) -> None:
         """The controller at a serial port, such as /dev/ttyUSB0 or COM3.
 

@@ -21,7 +21,7 @@ from slviewer.devices.opencv_controls import (
     set_exposure,
     set_value,
 )
-from slviewer.devices.opencv_reader import TIMING, Reader, Timing
+from slviewer.devices.opencv_reader import TIMING, Reader, StreamTiming
 from slviewer.devices.opencv_source import connect, describe_source, list_connected
 from slviewer.devices.opening import Openable
 from slviewer.devices.protocols import CameraSettings, Channel, check_frame, extract_channel
@@ -53,7 +53,7 @@ class OpenCVCamera(Openable):
         focus: float | None = None,
         white_balance: float | None = None,
         channel: Channel = "green",
-        timing: Timing = TIMING,
+        timing: StreamTiming = TIMING,
     ) -> None:
         """The webcam of that number, or the video at a path or an address.
 

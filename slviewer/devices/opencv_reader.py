@@ -1,7 +1,7 @@
 """One video capture on a thread of its own, which alone knows which of its pictures are new.
 
 Calls into a capture may block for as long as a driver or a network likes, so that callers who need a picture wait here,
-and not longer than `Timing.patience_s`. A live source is read without a break, wanted or not: unread pictures
+and not longer than `StreamTiming.patience_s`. A live source is read without a break, wanted or not: unread pictures
 accumulate in the buffers of the driver, of the network and of the sender, and arrive later as if they were new.
 """
 
@@ -29,7 +29,7 @@ T = TypeVar("T")
 
 
 @dataclass(frozen=True)
-class Timing:
+class StreamTiming:
     """How long a reader waits, in s of `clock`.
 
     `patience_s`: without a picture for so long, a source is lost. `opening_s`: a webcam's driver may take seconds to
@@ -44,7 +44,7 @@ class Timing:
     clock: Callable[[], float] = time.monotonic
 
 
-TIMING = Timing()
+TIMING = StreamTiming()
 """For real sources."""
 
 
@@ -127,7 +127,7 @@ class Reader:
     `connect` may raise DeviceError. So does every method once the source is lost: make another reader then.
     """
 
-    def __init__(self, name: str, connect: Callable[[], Connected], timing: Timing = TIMING) -> None:
+    def __init__(self, name: str, connect: Callable[[], Connected], timing: StreamTiming = TIMING) -> None:
         self._name, self._connect, self._timing = name, connect, timing
         self._condition = threading.Condition()
         self._jobs: deque[_Job] = deque()

@@ -8,7 +8,7 @@ from urllib.parse import urlsplit
 
 import cv2
 
-from slviewer.devices.opencv_reader import TIMING, Connected, Timing
+from slviewer.devices.opencv_reader import TIMING, Connected, StreamTiming
 from slviewer.errors import DeviceError
 
 # named, as OpenCV's own choice differs between its builds, and with it the units of every control
@@ -29,7 +29,7 @@ def describe_source(source: int | str) -> str:
     return f"the camera {source}" if _is_device(source) else f"the video {Path(source).name}"
 
 
-def connect(source: int | str, size: tuple[int, int] | None, timing: Timing = TIMING) -> Connected:
+def connect(source: int | str, size: tuple[int, int] | None, timing: StreamTiming = TIMING) -> Connected:
     """Open a source, a webcam at `size` (width, height) px where supported. Raises DeviceError.
 
     An address may take `patience_s` of the timing to answer, and later to send more.

@@ -18,7 +18,7 @@ from mjpeg import NetworkCamera, network_camera
 from slviewer.devices.capture import capture_with_texture
 from slviewer.devices.drivers import driver
 from slviewer.devices.opencv import OpenCVCamera
-from slviewer.devices.opencv_reader import Timing
+from slviewer.devices.opencv_reader import StreamTiming
 from slviewer.devices.opencv_source import list_sysfs_webcams
 from slviewer.devices.opening import Openable
 from slviewer.devices.protocols import CameraSettings, ColourCamera, Rig, check_index, check_level
@@ -28,7 +28,7 @@ from slviewer.fringe.sequence import PatternSequence
 
 SIZE = (160, 120)
 FPS = 60.0
-QUICK = Timing(warm_up_s=0.0, ended_s=0.05)
+QUICK = StreamTiming(warm_up_s=0.0, ended_s=0.05)
 """These sources give no dark pictures, and one that has ended stays so."""
 
 
@@ -186,7 +186,7 @@ def test_a_stream_says_that_its_settings_are_its_own():
 
 def test_a_stream_that_stalls_is_told_and_comes_back():
     clock = Hastened()
-    timing = Timing(warm_up_s=0.0, clock=clock)
+    timing = StreamTiming(warm_up_s=0.0, clock=clock)
     with network_camera(coded(1), FPS) as seen, opened(OpenCVCamera(seen.url, SIZE, timing=timing)) as camera:
         seen.going.clear()
         asked, clock.step_s = clock(), 1.0
@@ -247,7 +247,7 @@ def test_what_does_not_answer_is_told_within_seconds_and_in_one_sentence(tmp_pat
         ):
             begun = time.monotonic()
             with raises(DeviceError, *facts):
-                OpenCVCamera(source, timing=Timing(patience_s=0.2))
+                OpenCVCamera(source, timing=StreamTiming(patience_s=0.2))
             assert time.monotonic() - begun < HANG_S, source
     camera = OpenCVCamera("63", SIZE)  # with its size given, it may be plugged in later
     with raises(DeviceError, "camera 63"):

@@ -12,14 +12,14 @@ from mjpeg import network_camera
 from slviewer.devices import opencv as opencv_module
 from slviewer.devices.opencv import OpenCVCamera
 from slviewer.devices.opencv_controls import dialect_of, disable_automatics, exposure_ms, set_exposure
-from slviewer.devices.opencv_reader import Connected, Pace, Timing
+from slviewer.devices.opencv_reader import Connected, Pace, StreamTiming
 from slviewer.devices.opencv_source import connect
 from slviewer.devices.protocols import CameraSettings
 
 SIZE = (160, 120)
 FPS = 200.0
 """Of a picture that does not change."""
-QUICK = Timing(warm_up_s=0.0)
+QUICK = StreamTiming(warm_up_s=0.0)
 
 
 class Webcam:

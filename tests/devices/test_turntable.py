@@ -9,7 +9,7 @@ from facts import missing_facts, raises
 from gcode_controller import Controller, Fault
 
 from slviewer.devices.browser import PageChannels
-from slviewer.devices.grbl import ALARMS, ERRORS, GcodeTurntable, Timing
+from slviewer.devices.grbl import ALARMS, ERRORS, ControllerTiming, GcodeTurntable
 from slviewer.devices.protocols import Turntable
 from slviewer.devices.simulated import SimulatedTurntable
 from slviewer.devices.world import SimulatedWorld
@@ -23,9 +23,9 @@ from slviewer.simulation.rig import letter
 FAST: dict[str, Any] = {"speed_deg_s": 6000.0, "settle_ms": 0.0, "boot_s": 60.0, "reply_s": 60.0}
 
 
-def timing(controller: Controller) -> Timing:
+def timing(controller: Controller) -> ControllerTiming:
     """Waits for a controller that answers each line at once, in its own time."""
-    return Timing(poll_s=0.01, quiet_s=0.05, clock=controller.clock)
+    return ControllerTiming(poll_s=0.01, quiet_s=0.05, clock=controller.clock)
 
 
 @pytest.fixture(params=["simulated", "grbl", "marlin"])
