@@ -20,6 +20,7 @@ from slviewer.errors import hide_passwords
 from slviewer.report.page import Cell, Mark, Table
 from slviewer.server.text import escape
 
+NO_BREAK_HYPHEN = "\u2011"
 PICTURE_PX = 720
 """Width at which pictures are sent: viser shrinks a picture to its panel but never enlarges it."""
 
@@ -111,6 +112,7 @@ def report_table(shown: Table) -> Html:
         return coloured(text, tones.get(mark, "plain"), bold=mark in ("better", "strong"))
 
     titles = [shown.caption, *(c.title.capitalize() + (f", {c.unit}" if c.unit else "") for c in shown.columns[1:])]
+    titles = [title.replace("-", NO_BREAK_HYPHEN) for title in titles]  # a line ends between words, in any font
     html = table(titles, [[cell(value) for value in row] for row in (*shown.rows, *shown.footer)])
     return html + "".join(paragraph(coloured(note, "dim")) for note in shown.notes)
 
