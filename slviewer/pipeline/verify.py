@@ -1,7 +1,7 @@
 """Measuring known shapes with each model, and comparing."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import combinations
 from typing import Any, Literal
 
@@ -13,7 +13,7 @@ from slviewer.evaluation.plane import PlaneResult
 from slviewer.evaluation.render import render
 from slviewer.evaluation.sphere import SphereResult
 from slviewer.fringe.sequence import Axis
-from slviewer.pipeline.capture_clouds import check_capture_sizes
+from slviewer.pipeline.capture_clouds import capture_cloud, check_capture_sizes
 from slviewer.pipeline.capture_phases import capture_texture, decode_captures
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
 from slviewer.pipeline.models import (
@@ -157,10 +157,13 @@ def verify(
             }
             if store.is_writable:
                 _save_verification(store, shot.name, result, masked[shot.name])
-                if (best := preferred_model(store)) in clouds:
+                if (best := chosen.get(preferred_model(store))) is not None:  # by its own best axis, as reconstruct
                     texture = capture_texture(shot, frames, stretch=shot.role == "calibration")
-                    share = masked_share(chosen[best], phases[axis_used], region)
-                    save_cloud(store, shot.name, replace(clouds[best], texture=texture), phases[axis_used], share)
+                    cloud = capture_cloud(
+                        store, best, shot, phases, axis=axis, texture=texture, accept_rejected=accept_rejected
+                    )
+                    phase = phases[cloud.axis]
+                    save_cloud(store, shot.name, cloud, phase, masked_share(best, phase, region))
         scales = {name: words for name in chosen if (words := describe_scale(store, name))}
         progress(1.0, "measured")
     return Verification(results, masked, scales)

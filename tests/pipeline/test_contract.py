@@ -8,14 +8,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from clocks import HANG_S
 
 import slviewer as sl
 from slviewer.cli import main
 from slviewer.pipeline.certificate import make_certificate
 from slviewer.session.store import Session
 from slviewer.wizard.operator import Operator
-
-HANG_S = 600.0
 
 
 @dataclass(frozen=True)
@@ -58,10 +57,6 @@ def by_terminal(operation: Operation, session: Path) -> None:
     assert main([str(session) if word == "SESSION" else word for word in operation.terminal]) == 0
 
 
-def by_python(operation: Operation, session: Path) -> None:
-    operation.python(session)
-
-
 def by_wizard(operation: Operation, session: Path) -> None:
     with Operator(session) as operator:
         assert operation.wizard(operator)
@@ -69,7 +64,7 @@ def by_wizard(operation: Operation, session: Path) -> None:
         assert [notice.text for notice in operator.snapshot().notices if notice.level == "error"] == []
 
 
-DOORS = {"terminal": by_terminal, "python": by_python, "wizard": by_wizard}
+DOORS = {"terminal": by_terminal, "python": lambda operation, session: operation.python(session), "wizard": by_wizard}
 
 
 def records(session: Path, names: tuple[str, ...]) -> dict[str, tuple[dict[str, Any], dict[str, np.ndarray]]]:
@@ -132,6 +127,14 @@ def test_what_the_terminal_made_is_done_in_the_wizard_and_certified(done: tuple[
         certificate = make_certificate(store)
     assert set(operation.stored) <= set(certificate.results)
     assert {name for name in operation.stored if name.startswith("verify/")} <= set(certificate.figures)
+
+
+def test_verify_stores_the_cloud_that_reconstruct_does(recorded: Path, tmp_path: Path) -> None:
+    first, second = (shutil.copytree(recorded / "session", tmp_path / name) for name in ("verified", "reconstructed"))
+    sl.verify(first, ["plane_03"], "plane")
+    sl.reconstruct(second, "plane_03")
+    (verified,), (made,) = (records(session, ("clouds/plane_03",)).values() for session in (first, second))
+    assert verified[0] == made[0]  # with the checksums of the arrays
 
 
 def test_a_changed_capture_makes_the_record_stale(done: tuple[Operation, dict[str, Path]], tmp_path: Path) -> None:
