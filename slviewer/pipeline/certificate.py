@@ -353,8 +353,9 @@ def _repeat_calibration(
 def _verify_again(store: Session, fresh: Session, result: str) -> dict[str, float]:
     """Measure a plane or sphere again, with the models that were compared before; return its figures."""
     name, meta = result.removeprefix("verify/"), store.load_result(result, only=())[0]
-    found = verify(fresh, [name], meta["shape"], models=list(meta["models"]), check=False).captures[name].to_json()
-    return _verification_figures(found["models"])
+    with Session.open(fresh.folder) as reading:  # nothing needs to be stored
+        found = verify(reading, [name], meta["shape"], models=list(meta["models"]), check=False)
+    return _verification_figures(found.captures[name].to_json()["models"])
 
 
 def _measure_again(
