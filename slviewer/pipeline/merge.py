@@ -214,6 +214,7 @@ def merge(
         out = Path(out)
         if out.suffix.lower() != ".ply":
             raise UsageError(f"merged points are written as .ply, not as {out.name}: a mesh goes into other files too")
+        out.parent.mkdir(parents=True, exist_ok=True)  # or it fails now, not after minutes
     if angle is not None and start != "turntable":
         raise UsageError("an angle from scan to scan is that of a turntable: give --start turntable too, or neither")
     table_deg = None if angle is None else {name: angle * k for k, name in enumerate(names)}
