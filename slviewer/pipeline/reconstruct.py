@@ -46,8 +46,7 @@ class Reconstruction:
     measures the board. ``scale`` describes the correction of scale in it; ``masked`` is the share of the
     pixels that were masked because no target pose illuminated what they look through, None for models that mask none.
     ``frame``: the one that the points are in, in words. ``raised``: the calibration's residuals over their predicted
-    noise, by which sigmas are raised. ``uncut``: the cloud before edits and region, where there are any, which
-    ``restrictions`` describes.
+    noise, by which sigmas are raised. ``restrictions`` describes the edits and the region that it was cut by.
     """
 
     cloud: Cloud
@@ -59,7 +58,6 @@ class Reconstruction:
     masked: float | None = None
     frame: str = ""
     raised: float = 1.0
-    uncut: Cloud | None = None
     restrictions: tuple[str, ...] = ()
 
     def text(self) -> str:
@@ -191,9 +189,7 @@ def reconstruct(
                 save_cloud(store, capture, uncut, phases[cloud.axis], masked)
         progress(1.0, "reconstructed")
     count = int(np.count_nonzero(mask))
-    return Reconstruction(
-        cloud, phases, ply, count, board, scale, masked, frame, raised, None if cloud is uncut else uncut, restrictions
-    )
+    return Reconstruction(cloud, phases, ply, count, board, scale, masked, frame, raised, restrictions)
 
 
 def save_cloud(store: Session, capture: str, cloud: Cloud, phase: PhaseMap, masked: float | None) -> None:

@@ -157,7 +157,7 @@ def _check_options(name: str, part: str, options: Mapping[str, Any], where: str)
     if any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters):
         return
     # the program supplies these; they are no entries of a file
-    provided = ("board", "world", "clock", "timing", *(("page",) if drivers()[name].page else ()))
+    provided = ("board", "world", "timing", *(("page",) if drivers()[name].page else ()))
     known = [parameter for parameter in parameters if parameter.name not in provided]
     accepted = [parameter.name for parameter in known]
     unknown = sorted(set(options) - set(accepted))

@@ -22,7 +22,6 @@ from slviewer.pipeline.edit import SUPPORT, Selection, delete_points
 from slviewer.pipeline.feedback import Warn
 from slviewer.pipeline.merge import Merge, Picked, StartKind, merge
 from slviewer.pipeline.models import POSES_FOR_PIXELWISE, accepts_rejected, available_models
-from slviewer.pipeline.open_session import numbered_results
 from slviewer.pipeline.reconstruct import reconstruct
 from slviewer.pipeline.turn import WATERTIGHT, align_turn
 from slviewer.pipeline.validate import validate
@@ -179,7 +178,7 @@ def merge_turn(session: Session, names: list[str], report: Reporter, warn: Warn)
     """
     report_merge = report.within(0, 0.7)
     merged = align_turn(partial(merge_scans, session, names, names[0], report_merge, warn), warn)
-    number = numbered_results(session, "merge")[-1].removeprefix("merge/")
+    number = merged.result_name.removeprefix("merge/")
     try:
         words = export_file(session, "merged-mesh", number, "ply", WATERTIGHT, None, report.within(0.7, 1), warn)
     except Cancelled:
