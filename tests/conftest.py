@@ -19,6 +19,7 @@ from chromium import launched
 from filelock import FileLock
 from numba.core import event
 from playwright.sync_api import Browser, sync_playwright
+from small_fields import fit_few_cells
 
 os.environ["SLVIEWER_NO_PREPARATION"] = "1"  # wizards that tests start compile what they use, and nothing beside it
 sys.dont_write_bytecode = False  # what tests start as processes need not compile the sources again
@@ -115,7 +116,6 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     8 poses, planes, spheres and objects at quarter resolution, made once for all workers: only to be read or copied.
     """
-    from slviewer.calibration.splined import fields
     from slviewer.cli import main
 
     base = tmp_path_factory.getbasetemp()
@@ -123,8 +123,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     session, found = folder / "session", folder / "calibration.json"
     with FileLock(f"{folder}.lock"):
         if not folder.exists():
-            with pytest.MonkeyPatch.context() as patch:
-                patch.setattr(fields, "CELLS_ACROSS", 12)  # a hundredth of the time to solve, and as good for this rig
+            with fit_few_cells():
                 assert main(["simulate", str(session), "--scale", "0.25", "--poses", "8"]) == 0
                 assert main(["calibrate", str(session), "--target", "circles:21x16:9", "--json", str(found)]) == 0
     assert json.loads(found.read_text())["poses_used"], "the worker that made it failed"

@@ -18,7 +18,7 @@ from slviewer.records import from_plain, to_plain
 from slviewer.simulation.boards import Pose
 from slviewer.simulation.rig import letter
 
-pytestmark = pytest.mark.computes
+pytestmark = [pytest.mark.computes, pytest.mark.slow]
 
 RIG = letter(0.5, seed=3)
 FEW = 6  # later poses where a movement is looked for: it is seen in every one
@@ -43,7 +43,6 @@ def checked(reference, rig, i, name="later", **how) -> Drift:
     return check_drift(reference, DriftView.from_observation(seen(rig, later()[i], f"{name}_{i}", **how)))
 
 
-@pytest.mark.slow
 def test_an_unmoved_rig_raises_no_alarm(reference):
     found = [checked(reference, RIG, i) for i in range(2 * FEW)]
     assert [d.verdict for d in found] == ["still good"] * len(found)
@@ -51,7 +50,6 @@ def test_an_unmoved_rig_raises_no_alarm(reference):
     assert np.mean([d.chance for d in found]) == pytest.approx(0.5, abs=0.3)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("what", "how"),
     [
@@ -68,7 +66,6 @@ def test_small_movements_are_seen(reference, what, how):
     assert all(what in d.reasons[0] for d in found if d.reasons)
 
 
-@pytest.mark.slow
 def test_what_is_said_of_a_movement_is_right(reference):
     pan = checked(reference, moved(RIG, (0, 0.2, 0)), 1)
     assert pan.turn_mrad[1] == pytest.approx(0.2, abs=4 * pan.turn_sigma_mrad[1])
@@ -81,7 +78,6 @@ def test_what_is_said_of_a_movement_is_right(reference):
     assert longer.scale_ppm == pytest.approx(-1e6 * 0.2 / 180, rel=0.1)
 
 
-@pytest.mark.slow
 def test_one_axis_says_what_it_cannot_see(reference):
     still = checked(reference, RIG, 2, axes=("x",))
     assert still.verdict == "still good" and still.across_px is None
@@ -91,7 +87,6 @@ def test_one_axis_says_what_it_cannot_see(reference):
     assert checked(reference, moved(RIG, (0.05, 0, 0)), 2, axes=("x",)).verdict == "still good"
 
 
-@pytest.mark.slow
 def test_a_refocused_lens_is_no_movement(reference):
     fx, fy = RIG.projector.focal_px
     k1, *others = RIG.projector.brown
@@ -101,7 +96,6 @@ def test_a_refocused_lens_is_no_movement(reference):
     assert missing_facts(found.reasons[0], "lens", f"{found.misfit_px:.3f}") == []
 
 
-@pytest.mark.slow
 def test_an_answer_survives_json(reference):
     found = checked(reference, moved(RIG, (0.05, 0.05, 0)), 4)
     assert from_plain(json.loads(json.dumps(to_plain(found))), Drift) == found
@@ -109,7 +103,6 @@ def test_an_answer_survives_json(reference):
     assert missing_facts(found.text(), found.verdict, *found.reasons) == []
 
 
-@pytest.mark.slow
 def test_too_few_poses_set_no_floor(reference):
     views = [DriftView.from_observation(seen(RIG, pose, "few")) for pose in later()[: MIN_POSES - 1]]
     with raises(InputError, MIN_POSES - 1, MIN_POSES):

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 from facts import missing_facts
+from small_fields import fit_few_cells
 
 from slviewer.pipeline.models import load_stereo
 from slviewer.session.exporters import write_calibration
@@ -142,12 +143,10 @@ def test_report_and_inspect(calibrated: dict, session: Path, run: Run, tmp_path:
 
 
 @pytest.mark.slow
-def test_reproduce_remakes_the_letters_tables_and_figures(
-    session: Path, run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("slviewer.calibration.splined.fields.CELLS_ACROSS", 12)
+def test_reproduce_remakes_the_letters_tables_and_figures(session: Path, run: Run, tmp_path: Path) -> None:
     out = session.parent  # whose session is what reproduce would simulate, but for fewer poses
-    status, text, _ = run("reproduce", "--scale", "0.25", "--out", out, "--json", tmp_path / "figures.json")
+    with fit_few_cells():
+        status, text, _ = run("reproduce", "--scale", "0.25", "--out", out, "--json", tmp_path / "figures.json")
     assert status == 0
     found = json.loads((tmp_path / "figures.json").read_text())
     assert len(found["planes"]) == 10 and len(found["spheres"]) == 6

@@ -6,8 +6,7 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
-
-from slviewer.calibration.splined import fields
+from small_fields import fit_few_cells
 
 DOCS = Path(__file__).parents[2] / "docs"
 
@@ -24,7 +23,5 @@ def figures() -> ModuleType:
 
 @pytest.fixture(scope="module")
 def few_cells() -> Iterator[None]:
-    """Fit displacement fields of fewer cells: a hundredth of the time to solve, and as good for the simulated rigs."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(fields, "CELLS_ACROSS", 12)
+    with fit_few_cells():
         yield

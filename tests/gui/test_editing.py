@@ -39,7 +39,7 @@ from slviewer.validation.bench_live import true_calibration
 from slviewer.wizard.operator import Operator
 from slviewer.wizard.result_views import scan_cloud, whole_cloud
 
-pytestmark = pytest.mark.computes
+pytestmark = [pytest.mark.computes, pytest.mark.slow]
 
 CORNERS = ((-30, -30), (30, -30), (30, 30), (-30, 30))
 """Of an outline around a place on the page, px."""
@@ -155,7 +155,6 @@ def count_selected(page: Page) -> int:
     return int(text.split(" of ")[0].replace(",", ""))
 
 
-@pytest.mark.slow
 def test_points_are_selected_deleted_and_restored(wizard: tuple[Opened, App, Operator, Views]) -> None:
     opened, app, operator, views = wizard
     page = opened.page
@@ -200,7 +199,6 @@ def test_points_are_selected_deleted_and_restored(wizard: tuple[Opened, App, Ope
     assert opened.errors == []
 
 
-@pytest.mark.slow
 def test_points_of_two_scans_are_deleted_and_restored_in_step_merge(
     wizard: tuple[Opened, App, Operator, Views],
 ) -> None:
@@ -236,7 +234,6 @@ def test_points_of_two_scans_are_deleted_and_restored_in_step_merge(
     assert opened.errors == []
 
 
-@pytest.mark.slow
 def test_region_is_set_by_numbers_and_by_handle(wizard: tuple[Opened, App, Operator, Views]) -> None:
     opened, app, operator, _ = wizard
     page = opened.page
@@ -285,7 +282,6 @@ def test_region_is_set_by_numbers_and_by_handle(wizard: tuple[Opened, App, Opera
     assert opened.errors == []
 
 
-@pytest.mark.slow
 def test_six_clicks_make_textured_mesh_of_part_without_its_table(tmp_path: Path, browser: Browser) -> None:
     folder, rig = tmp_path / "session", letter(0.25)
     true_calibration(folder, rig)
@@ -334,7 +330,6 @@ def test_six_clicks_make_textured_mesh_of_part_without_its_table(tmp_path: Path,
     assert np.asarray(mesh.visual.material.baseColorTexture).shape[:2] == (2048, 2048)
 
 
-@pytest.mark.slow
 def test_plan_is_made_uploaded_and_run_on_two_scans(tmp_path: Path, browser: Browser) -> None:
     folder, rig = tmp_path / "session", letter(0.25)
     true_calibration(folder, rig)

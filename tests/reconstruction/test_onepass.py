@@ -84,15 +84,15 @@ def points_of(model, phase):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("make", [pixelwise, splined])
-@pytest.mark.parametrize("dtype", [np.uint8, pytest.param(np.uint16)])
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
 @pytest.mark.parametrize(
     "name",
     [
         "18 steps and Gray code",
         "heterodyne, 7 steps",
         "offset and falling phase",
-        pytest.param("3 steps and complementary code", marks=pytest.mark.slow),
-        pytest.param("three frequencies of 4 steps", marks=pytest.mark.slow),
+        "3 steps and complementary code",
+        "three frequencies of 4 steps",
     ],
 )
 def test_it_is_the_definition(name, dtype, make):

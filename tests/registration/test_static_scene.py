@@ -19,7 +19,7 @@ from slviewer.simulation.mesh import MeshScene
 from slviewer.simulation.scenes import Surface
 from slviewer.simulation.turning import AXIS, AXIS_POINT, turning
 
-pytestmark = pytest.mark.computes
+pytestmark = [pytest.mark.computes, pytest.mark.slow]
 
 NOISE = 0.04
 SIZE = (220, 165)
@@ -67,7 +67,6 @@ def scans(deg: float, wall: bool) -> tuple[dict[str, Cloud], dict[str, np.ndarra
     return clouds, {name: cloud.points[..., 2] > 700 for name, cloud in clouds.items()}
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("deg", [pytest.param(2.0, marks=pytest.mark.slow), 25.0])
 def test_a_wall_behind_a_turned_object_is_recognised_and_does_not_move_it(deg: float) -> None:
     alone, _ = scans(deg, wall=False)
@@ -85,7 +84,6 @@ def test_a_wall_behind_a_turned_object_is_recognised_and_does_not_move_it(deg: f
     assert 0 <= found.contradictions["b", "a"].share < 0.02
 
 
-@pytest.mark.slow
 def test_an_object_alone_has_nothing_that_stands_still() -> None:
     clouds, _ = scans(25.0, wall=False)
     found = register_object(clouds, "a")
@@ -94,7 +92,6 @@ def test_an_object_alone_has_nothing_that_stands_still() -> None:
     assert found.contradictions["b", "a"].share < 0.01 and found.contradictions["b", "a"].compared > 1000
 
 
-@pytest.mark.slow
 def test_a_scan_that_is_all_holes_says_where_its_points_are_lost() -> None:
     clouds = dict(scans(25.0, wall=True)[0])
     sparse = clouds["b"].points.copy()
@@ -106,7 +103,6 @@ def test_a_scan_that_is_all_holes_says_where_its_points_are_lost() -> None:
     assert trusted < total and 10_000 <= total <= clouds["b"].mask.sum()
 
 
-@pytest.mark.slow
 def test_steps_within_the_noise_are_no_edges() -> None:
     clouds, _ = scans(25.0, wall=True)
     z = clouds["a"].points[..., 2]
@@ -116,7 +112,6 @@ def test_steps_within_the_noise_are_no_edges() -> None:
     assert away_from_edges(points, np.full(z.shape, 3.0)).mean() > 0.6
 
 
-@pytest.mark.slow
 def test_contradictions_are_counted_where_one_scan_sees_through_the_others_points() -> None:
     clouds, wall = scans(2.0, wall=True)
     views = {name: sample_surface(cloud.measured) for name, cloud in clouds.items()}
@@ -128,7 +123,6 @@ def test_contradictions_are_counted_where_one_scan_sees_through_the_others_point
     assert 0.001 < still < 0.5 * (1 - share)
 
 
-@pytest.mark.slow
 def test_real_shells_turn_while_their_background_stands_still(real_data: Path) -> None:
     clouds = {}
     calibration = real_data / "sltk_shells" / "procam_2016_12_09.yaml"

@@ -12,9 +12,9 @@ import pytest
 import trimesh
 from facts import missing_facts, raises
 from scipy.spatial import cKDTree
+from small_fields import fit_few_cells
 from wizard_events import HANG_S, SPARING, list_texts
 
-from slviewer.calibration.splined import fields
 from slviewer.errors import Cancelled
 from slviewer.session.ply import read_ply
 from slviewer.session.store import Session
@@ -24,7 +24,7 @@ from slviewer.wizard.jobs import Reporter
 from slviewer.wizard.operator import Operator
 from slviewer.wizard.snapshot import SessionView, Snapshot
 
-pytestmark = pytest.mark.computes
+pytestmark = [pytest.mark.computes, pytest.mark.slow]
 
 RIG = {"driver": "simulated", "scale": 0.25, "seed": 0}
 POSES = 8
@@ -33,8 +33,7 @@ POSES = 8
 @contextmanager
 def flown(folder: Path, patterns: str, acts: list[str]) -> Iterator[Operator]:
     """An operator of the session in this folder, in which the autopilot has done its acts."""
-    with pytest.MonkeyPatch.context() as patch, Operator(folder, RIG, timing=SPARING) as operator:
-        patch.setattr(fields, "CELLS_ACROSS", 12)  # a hundredth of the time to solve, and as good for this rig
+    with fit_few_cells(), Operator(folder, RIG, timing=SPARING) as operator:
         operator.choose_patterns(patterns)
         Autopilot(operator, poses=POSES, patience_s=HANG_S, before=acts.append).run()
         yield operator
@@ -63,13 +62,11 @@ def session_of(snapshot: Snapshot) -> SessionView:
     return snapshot.session
 
 
-@pytest.mark.slow
 def test_the_flight_from_recorded_poses_reaches_a_merged_ply(operator: Operator, acts: list[str]) -> None:
     assert_all_is_measured(operator.snapshot(), acts)
     assert "Capturing pose 7 of 8" not in acts
 
 
-@pytest.mark.slow
 def test_the_flight_reaches_a_merged_ply(tmp_path: Path) -> None:
     acts: list[str] = []
     with flown(tmp_path / "session", "complementary", acts) as operator:
@@ -111,7 +108,6 @@ def assert_all_is_measured(snapshot: Snapshot, acts: list[str]) -> None:
     assert 130 < width.quantities[0].value < 150  # the ammonite's
 
 
-@pytest.mark.slow
 def test_poses_are_asked_for_until_the_wanted_sigma_is_reached(operator: Operator) -> None:
     assert operator.set_wanted_sigma(0.0001) and operator.set_hands_free(True)
     snapshot = operator.wait_until_idle(HANG_S)
@@ -126,7 +122,6 @@ def test_poses_are_asked_for_until_the_wanted_sigma_is_reached(operator: Operato
     assert snapshot.step("poses").state == "done"
 
 
-@pytest.mark.slow
 def test_panels_find_what_they_draw(operator: Operator) -> None:
     store = operator.session
     assert store is not None
@@ -143,7 +138,6 @@ def test_panels_find_what_they_draw(operator: Operator) -> None:
     assert result_views.merged_cloud(store, "1").normals is not None
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("where", "make"),
     [
@@ -196,7 +190,6 @@ def test_work_given_up_inside_a_long_call_saves_nothing(
         assert store.state_of("poses/pose_05") == "absent"
 
 
-@pytest.mark.slow
 def test_files_for_other_programs(operator: Operator) -> None:
     assert operator.export("mesh", "scan_01", "stl") and operator.export("mesh", "scan_01", "glb")
     assert operator.export("cloud", "scan_02") and operator.export("calibration") and operator.export("table")
@@ -228,7 +221,6 @@ def read_head(path: Path) -> str:
         return file.read(1000).decode("ascii", "replace")
 
 
-@pytest.mark.slow
 def test_a_scale_that_was_applied_is_in_the_clouds_and_makes_older_ones_stale(operator: Operator) -> None:
     store = operator.session
     assert store is not None
@@ -251,7 +243,6 @@ def test_a_scale_that_was_applied_is_in_the_clouds_and_makes_older_ones_stale(op
     assert operator.choose_model("") and not operator.choose_model("anchored")
 
 
-@pytest.mark.slow
 def test_what_changes_makes_stale_what_came_from_it(operator: Operator) -> None:
     assert operator.exclude("pose_02")
     stale = operator.wait_until_idle(HANG_S)
