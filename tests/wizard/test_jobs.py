@@ -191,6 +191,7 @@ def read_memory_mb() -> float:
 @pytest.mark.slow
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other C libraries are left alone")
 def test_memory_freed_between_blocks_in_use_is_returned() -> None:
+    release_memory()  # what other tests left
     blocks = [b"x" * 100_000 for _ in range(2000)]  # smaller than what the system gives in whole pages
     in_use = blocks[::20]
     del blocks
