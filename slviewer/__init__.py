@@ -53,13 +53,15 @@ if TYPE_CHECKING:
     from slviewer.pipeline.mesh import mesh
     from slviewer.pipeline.models import load_calibration
     from slviewer.pipeline.reconstruct import reconstruct
-    from slviewer.pipeline.verify import Verification, verify
+    from slviewer.pipeline.stored_records import load_arrays
+    from slviewer.pipeline.verify import verify
     from slviewer.reconstruction.cloud import Cloud
     from slviewer.reconstruction.reconstruct import reconstruct as reconstruct_cloud
+    from slviewer.records.verification import Verification
     from slviewer.registration.multiway import register_all as align_clouds
     from slviewer.report.maps import error_maps as draw_error_maps
     from slviewer.session.measurements import Measurement
-    from slviewer.session.ply import write_ply
+    from slviewer.session.ply import read_ply, write_ply
     from slviewer.session.store import Session
     from slviewer.surface.fuse import fuse as fuse_clouds
     from slviewer.surface.meshing import build_mesh as mesh_cloud
@@ -82,7 +84,7 @@ _EXPORTS = {
     "Quantity": "inspection.quantities",
     "Session": "session.store",
     "SlviewerError": "errors",
-    "Verification": "pipeline.verify",
+    "Verification": "records.verification",
     "align_clouds": "registration.multiway:register_all",
     "calibrate": "pipeline.calibrate",
     "calibrate_frames": "pipeline.calibrate",
@@ -97,6 +99,7 @@ _EXPORTS = {
     "fuse_clouds": "surface.fuse:fuse",
     "gray": "fringe.presets",
     "import_captures": "pipeline.import_captures",
+    "load_arrays": "pipeline.stored_records",
     "load_calibration": "pipeline.models",
     "measure": "pipeline.measure",
     "merge": "pipeline.merge",
@@ -107,6 +110,7 @@ _EXPORTS = {
     "p18": "fringe.presets",
     "plugins": "plugins:*",
     "read_captures": "pipeline.import_captures",
+    "read_ply": "session.ply",
     "reconstruct": "pipeline.reconstruct",
     "reconstruct_cloud": "reconstruction.reconstruct:reconstruct",
     "save_calibration": "pipeline.calibrate",
@@ -121,8 +125,9 @@ __all__ = [
     "Session", "SlviewerError", "Verification",
     "align_clouds", "calibrate", "calibrate_frames", "check_description", "complementary", "datasets", "decode",
     "detect_board", "draw_error_maps", "evaluate_plane", "evaluate_sphere", "fuse_clouds", "gray", "import_captures",
-    "load_calibration", "measure", "merge", "mesh", "mesh_cloud", "micro", "multifrequency", "p18", "plugins",
-    "read_captures", "reconstruct", "reconstruct_cloud", "save_calibration", "texture", "verify", "write_ply",
+    "load_arrays", "load_calibration", "measure", "merge", "mesh", "mesh_cloud", "micro", "multifrequency", "p18",
+    "plugins", "read_captures", "read_ply", "reconstruct", "reconstruct_cloud", "save_calibration", "texture", "verify",
+    "write_ply",
 ]  # fmt: skip
 
 

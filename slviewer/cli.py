@@ -7,6 +7,7 @@ Results go to standard output, progress and warnings to standard error. Exit sta
 import os
 import sys
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import MISSING, fields
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -49,19 +50,32 @@ DESCRIPTION = "Structured-light 3D scanning: calibrate a camera and a projector,
 
 
 class Commands(Mapping[str, Callable[..., Any]]):
-    """Commands by name, each made when it is first used: that reads the source of its function."""
+    """Commands by name, each made when it is first used: that reads the source of its function.
+
+    Operations that other code has registered are commands too.
+    """
 
     def __init__(self, make: Mapping[str, Callable[[], Callable[..., Any]]]) -> None:
         self._make = make
 
     def __getitem__(self, name: str) -> Callable[..., Any]:
-        return self._make[name]()
+        return self._make[name]() if name in self._make else _make_operation_command(name)
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._make)
 
     def __len__(self) -> int:
         return len(self._make)
+
+
+def _make_operation_command(name: str) -> Callable[..., Any]:
+    """Return the command of an operation that is registered in this process; its settings without defaults are
+    positional. Raises KeyError where there is none."""
+    registry = sys.modules.get("slviewer.pipeline.operation")
+    operation = getattr(registry, "OPERATIONS", {})[name]
+    required = [each.name for each in fields(operation.settings) if each.default is MISSING]
+    source = f"{operation.function.__module__}:{operation.function.__name__}"
+    return read_command(source, "session", *required, options=[JSON])
 
 
 COMMANDS = Commands(

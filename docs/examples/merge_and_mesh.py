@@ -16,12 +16,12 @@ simulate(session, preset="turn", scale=SCALE, poses=8)
 sl.calibrate(session, "circles:21x16:9")
 scans = ["object_r1", "object_r2", "object_r3"]
 merged = sl.merge(session, scans, "object_r2")
-for scan, pair in merged.pairs.items():
+for scan, pair in merged.only.pairs.items():
     print(f"{scan}: {pair.rms_mm:.3f} mm from the reference where they overlap")
 meshed = sl.mesh(session, ["merge/1"], plan=MeshingPlan(triangles=20_000))
 print(meshed.text())
 
-surface = merged.fused.surface
+surface = sl.read_ply(merged.files[0])
 assert surface.normals is not None
 x, y = surface.points[::2, 0], -surface.points[::2, 1]
 shade = surface.normals[::2] @ [-0.4, -0.5, -0.77]  # lit from the upper left, behind the camera

@@ -9,6 +9,7 @@ import ast
 import inspect
 import json
 import re
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -16,7 +17,7 @@ from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from types import GenericAlias, MappingProxyType
-from typing import Annotated, Any, Literal, Union, get_args
+from typing import Annotated, Any, Literal, Protocol, Union, get_args, runtime_checkable
 
 import tyro
 
@@ -24,6 +25,18 @@ from slviewer import terminal
 from slviewer.errors import SlviewerError, UsageError
 
 ModelName = Literal["stereo", "pixelwise", "splined"]
+
+
+@runtime_checkable
+class Operational(Protocol):
+    """An operation of `slviewer.pipeline.operation`, which is not imported here: it brings NumPy."""
+
+    settings: Callable[..., Any]
+
+    def run(self, session: Any, settings: Any, progress: Any, warn: Any) -> Any:
+        """Run the operation on a session."""
+
+
 Run = Callable[[Callable[..., Any], dict[str, Any]], None]
 TYPES: dict[str, Any] = {"SessionLike": Path, "ModelName": ModelName, "Size": str}
 """What the terminal takes for types that are wider in Python; all others are looked up in the function's module."""
@@ -70,7 +83,7 @@ def read_command(
     description: str = "",
     run: Run | None = None,
 ) -> Callable[..., Callable[[], None]]:
-    """Return the command of the function ``module:function`` of slviewer, for tyro.
+    """Return the command of the function ``module:function`` of slviewer, or of a module in use, for tyro.
 
     The command's value is the work to do once all arguments are parsed.
 
@@ -79,15 +92,19 @@ def read_command(
     function's own, ``run``: what to do with the function and its arguments, by default `show_result`.
     """
     module, _, name = source.partition(":")
-    module = f"slviewer.{module}"
+    module = module if module in sys.modules else f"slviewer.{module}"
     definition = _read_definitions(module)[name]
     assert isinstance(definition, ast.FunctionDef)
-    doc = ast.get_docstring(definition) or ""
+    doc, accepted = ast.get_docstring(definition) or "", _list_arguments(definition)
+    if (settings := _find_settings(definition, module)) is not None:  # an operation
+        given = ast.get_docstring(settings) or ""
+        doc = f"{doc}\n\nArgs:\n    session: Session folder.\n{given.partition('Args:' + chr(10))[2]}"
+        accepted = [(ast.arg("session", ast.Name("SessionLike")), None), *_list_fields(settings)]
     described = re.match(r".*?^Args:\n(?:[ ].*\n?|\n(?=[ ]))*", doc, re.DOTALL | re.MULTILINE)
     doc = described[0] if described else re.split(r"\n\n", doc)[0]
     shown = re.findall(r"^ {4}(\w+):", doc, re.MULTILINE)
     parameters = []
-    for argument, default in _list_arguments(definition):
+    for argument, default in accepted:
         if argument.arg not in shown:
             continue
         assert argument.annotation is not None
@@ -148,6 +165,9 @@ def show_result(
 
 def call(function: Callable[..., Any], **arguments: Any) -> Any:
     """Call the function and return its result; its progress and warnings go to standard error."""
+    if isinstance(function, Operational):
+        session = arguments.pop("session")
+        return function.run(session, function.settings(**arguments), terminal.progress, terminal.warn)
     callbacks = {"progress": terminal.progress, "warn": terminal.warn}
     heard = {name: callbacks[name] for name in callbacks if name in inspect.signature(function).parameters}
     return function(**arguments, **heard)
@@ -156,7 +176,7 @@ def call(function: Callable[..., Any], **arguments: Any) -> Any:
 def write_json(path: Path | None, result: object) -> None:
     """Write a result, plain values or dataclasses, to the file of ``--json``; nothing without one."""
     if path is not None:
-        from slviewer.records import to_plain  # lazily: it brings NumPy
+        from slviewer.records.plain import to_plain  # lazily: it brings NumPy
 
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps(result, indent=2, default=to_plain) + "\n")
@@ -183,6 +203,28 @@ def _make_parameter(name: str, kind: Any, default: Any) -> inspect.Parameter:
     return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, annotation=kind, default=default)
 
 
+def _find_settings(definition: ast.FunctionDef, module: str) -> ast.ClassDef | None:
+    """Return the class of the settings of an operation, as its decorator names it; None for other functions."""
+    for decorator in definition.decorator_list:
+        if (
+            isinstance(decorator, ast.Call)
+            and isinstance(decorator.func, ast.Name)
+            and decorator.func.id == "operation"
+        ):
+            name = decorator.args[2]
+            assert isinstance(name, ast.Name)
+            settings = _read_definitions(module)[name.id]
+            assert isinstance(settings, ast.ClassDef)
+            return settings
+    return None
+
+
+def _list_fields(settings: ast.ClassDef) -> list[tuple[ast.arg, ast.expr | None]]:
+    """List the fields of a dataclass with their defaults, None where they have none."""
+    fields = [node for node in settings.body if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name)]
+    return [(ast.arg(node.target.id, node.annotation), node.value) for node in fields]  # type: ignore[union-attr]
+
+
 def _list_arguments(definition: ast.FunctionDef) -> list[tuple[ast.arg, ast.expr | None]]:
     """List every parameter of a function with its default, None where it has none."""
     places, defaults = definition.args.args, definition.args.defaults
@@ -198,7 +240,7 @@ def _read_definitions(module: str) -> dict[str, ast.stmt]:
     assert spec is not None and spec.origin is not None
     definitions: dict[str, ast.stmt] = {}
     for node in ast.parse(Path(spec.origin).read_text(encoding="utf-8")).body:
-        if isinstance(node, ast.FunctionDef):
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
             definitions[node.name] = node
         elif isinstance(node, ast.Assign | ast.AnnAssign):
             target = node.targets[0] if isinstance(node, ast.Assign) else node.target

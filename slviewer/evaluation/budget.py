@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from slviewer.evaluation.render import render
-from slviewer.records import to_plain
+from slviewer.records.plain import to_plain
 
 COVERAGE = 2.0
 

@@ -2,7 +2,8 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
@@ -17,12 +18,10 @@ from slviewer.evaluation.region import (
     start_plane,
     start_sphere,
 )
-from slviewer.evaluation.render import Row, render
 from slviewer.evaluation.sphere import SphereResult, evaluate_sphere
 from slviewer.geometry.shapes import Plane, Sphere
 from slviewer.reconstruction.cloud import Cloud
-
-Shape = Literal["plane", "sphere"]
+from slviewer.records.verification import ModelFit, Shape, Vector, Verification
 
 LEAST_SHARE = 0.5
 """Of the scene's measured pixels, that a plane must hold to be what was captured."""
@@ -58,8 +57,8 @@ class Comparison:
         messages = [f"{model}: {result.warning}" for model, result in self.results.items() if result.warning]
         if self.is_searched and self.shape == "plane" and self.share < LEAST_SHARE:
             messages.append(
-                f"the largest plane holds {100 * self.share:.0f} % of the measured pixels ({self.region_text()}), and "
-                "the figures are of it alone: is this a capture of a plane?"
+                f"the largest plane holds {100 * self.share:.0f} % of the measured pixels "
+                f"({self.region_text()}), and the figures are of it alone: is this a capture of a plane?"
             )
         ratios = {model: result.rms_mm / result.noise_floor_mm for model, result in self.results.items()}
         known = {model: ratio for model, ratio in ratios.items() if np.isfinite(ratio)}
@@ -78,39 +77,34 @@ class Comparison:
             return ""
         return f"columns {columns[0]}-{columns[-1]}, rows {rows[0]}-{rows[-1]}"
 
-    def text(self) -> str:
-        """Return a report for the terminal: a line per model, with the shares in R1, R2, R3 above."""
-        table: list[Row] = []
-        for model, result in self.results.items():
-            row: Row = {"model": model, "RMS mm": result.rms_mm, "noise floor mm": result.noise_floor_mm}
-            if isinstance(result, SphereResult):
-                row["radius"] = result.radius_mm
-            coverage = 100.0 * self.coverage[model]
-            table.append(
-                row | {"points": result.points, "set aside %": 100.0 * result.set_aside_share, "coverage %": coverage}
-            )
-        shares = (
-            "" if self.incidence is None else ", ".join(f"{r} {share:.1f} %" for r, share in self.incidence.items())
-        )
-        where = self.region_text()
-        if where:
-            where = f"region: {where}, {100 * self.share:.0f} % of the measured pixels; coverage is of this region"
-        return "\n".join([*(line for line in (shares, where) if line), render(table)])
+    def record(self, masked: Mapping[str, float] = MappingProxyType({}), **origin: Any) -> Verification:
+        """Return the figures without the maps.
 
-    def to_json(self) -> dict[str, Any]:
-        """For JSON: the figures without the maps; what is not known is None."""
-        models = {
-            model: {
-                "rms_mm": result.rms_mm,
-                "noise_floor_mm": _known(result.noise_floor_mm),
-                "radius_mm": result.radius_mm if isinstance(result, SphereResult) else None,
-                "points": result.points,
-                "set_aside": result.set_aside,
-                "coverage": _known(self.coverage[model]),
-            }
-            for model, result in self.results.items()
-        }
-        return {"shape": self.shape, "incidence": self.incidence, "share": _known(self.share), "models": models}
+        ``masked``: {model: share that it masks}, of models that do; ``origin``: the record's inputs and scales.
+        """
+        rows, columns = np.flatnonzero(self.region.any(axis=1)), np.flatnonzero(self.region.any(axis=0))
+        return Verification(
+            shape=self.shape,
+            models={
+                model: ModelFit(
+                    points=result.points,
+                    excluded=result.set_aside,
+                    rms_mm=result.rms_mm,
+                    noise_floor_mm=_known(result.noise_floor_mm),
+                    coverage=_known(self.coverage[model]),
+                    radius_mm=result.radius_mm if isinstance(result, SphereResult) else None,
+                    centre_mm=_make_vector(result.sphere.centre) if isinstance(result, SphereResult) else None,
+                    normal=_make_vector(result.plane.normal) if isinstance(result, PlaneResult) else None,
+                    offset_mm=float(result.plane.offset) if isinstance(result, PlaneResult) else None,
+                    masked=masked.get(model),
+                )
+                for model, result in self.results.items()
+            },
+            incidence=self.incidence,
+            share=_known(self.share),
+            region_px=(int(columns[0]), int(columns[-1]), int(rows[0]), int(rows[-1])),
+            **origin,
+        )
 
 
 def compare(
@@ -196,6 +190,12 @@ def _coverage_share(cloud: Cloud, region: np.ndarray, illuminated: np.ndarray | 
     if illuminated is None or measurable == 0:
         return float("nan")
     return np.count_nonzero(region & illuminated & cloud.mask) / measurable
+
+
+def _make_vector(values: np.ndarray) -> Vector:
+    """Return an array (3,) as plain numbers."""
+    x, y, z = map(float, values)
+    return x, y, z
 
 
 def _known(value: float) -> float | None:

@@ -21,7 +21,7 @@ from slviewer.geometry.rig import StereoRig
 from slviewer.geometry.rigid import fit_rigid, move_points
 from slviewer.geometry.shapes import fit_plane
 from slviewer.reconstruction.reconstruct import Model
-from slviewer.records import to_plain
+from slviewer.records.plain import to_plain
 
 FOLDS = 5
 LEAST_POSES = 5

@@ -7,7 +7,7 @@ import numpy as np
 from slviewer.inspection.features import Feature
 from slviewer.inspection.quantities import Quantity
 from slviewer.inspection.section import CutPlane
-from slviewer.records import from_plain
+from slviewer.records.plain import from_plain
 from slviewer.session.measurements import Measurement
 
 _UNITS = {"deg": "°", "%": " %", "": ""}

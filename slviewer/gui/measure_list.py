@@ -140,7 +140,7 @@ class MeasurementList:
         if self._session is None:
             return {}
         merge = self._session.merge
-        merged = {} if merge is None else {f"merge/{merge.name}": f"merge of {len(merge.scans)} scans"}
+        merged = {} if merge is None else {f"merge/{merge.name}": f"merge of {len(merge.record.scans)} scans"}
         return {scan.name: scan.label for scan in self._session.scans} | merged
 
     def _clear_drawings(self) -> None:

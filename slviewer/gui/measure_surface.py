@@ -58,12 +58,12 @@ class SurfaceView:
         offered = [(scan.name, display_name(scan.name, scan.label)) for scan in scans]
         folder = session.folder if session else None
         cut = session.restriction if session else lambda _: (None, ())
-        self._versions = {s.name: (folder, s.model, s.points, s.noise_mm, s.scale, *cut(s.name)) for s in scans}
+        self._versions = {s.name: (folder, s.figures, *cut(s.name)) for s in scans}
         merge = session.merge if session else None
         if merge is not None and not merge.stale:
             name = f"{MERGED}{merge.name}"
-            offered.append((name, f"Merge of {len(merge.scans)} scans"))
-            self._versions[name] = (folder, merge.points)
+            offered.append((name, f"Merge of {len(merge.record.scans)} scans"))
+            self._versions[name] = (folder, merge.record.points)
         self._choice.offer(offered)
         self.request()
 

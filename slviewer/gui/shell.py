@@ -284,7 +284,7 @@ def autopilot_step(snapshot: Snapshot) -> str:
     if job.startswith("Merg"):
         return "merge"
     latest = next((scan.name for scan in reversed(session.scans) if scan.purpose == "scan"), "")
-    if session.merge is None or latest not in session.merge.scans:
+    if session.merge is None or latest not in session.merge.record.scans:
         return "scan"
     return "export" if any(measured.source == latest for measured in session.measurements) else "measure"
 

@@ -8,8 +8,10 @@ import base64
 import io
 import re
 import wave
-from collections.abc import Sequence
-from typing import ClassVar, Literal
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from types import MappingProxyType
+from typing import Any, ClassVar, Literal
 
 import cv2
 import numpy as np
@@ -17,7 +19,8 @@ import viser
 from numpy.typing import NDArray
 
 from slviewer.errors import hide_passwords
-from slviewer.report.page import Cell, Mark, Table
+from slviewer.pipeline.stored_records import Stored
+from slviewer.records.table import Mark, Table
 from slviewer.server.text import escape
 
 NO_BREAK_HYPHEN = "\u2011"
@@ -102,19 +105,43 @@ def table(titles: Sequence[object], rows: Sequence[Sequence[object]]) -> Html:
 
 
 def report_table(shown: Table) -> Html:
-    """Return a table of the report, with its notes."""
-
-    def cell(value: str | Cell) -> Html:
-        """Return the text of a cell, coloured by its mark."""
-        mark = value.mark if isinstance(value, Cell) else ""
-        text = value.text if isinstance(value, Cell) else value
-        tones: dict[Mark, Tone] = {"better": "good", "worse": "warning", "muted": "dim"}
-        return coloured(text, tones.get(mark, "plain"), bold=mark in ("better", "strong"))
-
+    """Return a table of figures without its details, with its notes."""
+    tones: dict[Mark, Tone] = {"better": "good", "worse": "warning", "muted": "dim"}
+    shown = shown.select([column for column in shown.columns if not column.detail])
     titles = [shown.caption, *(c.title.capitalize() + (f", {c.unit}" if c.unit else "") for c in shown.columns[1:])]
     titles = [title.replace("-", NO_BREAK_HYPHEN) for title in titles]  # a line ends between words, in any font
-    html = table(titles, [[cell(value) for value in row] for row in (*shown.rows, *shown.footer)])
-    return html + "".join(paragraph(coloured(note, "dim")) for note in shown.notes)
+    rows = [
+        [
+            coloured(text, tones.get(mark, "plain"), bold=mark in ("better", "strong"))
+            for _, text, mark in shown.format(row)
+        ]
+        for row in (*shown.rows, *shown.footer)
+    ]
+    return table(titles, rows) + "".join(paragraph(coloured(note, "dim")) for note in shown.notes)
+
+
+def records_html(found: Sequence[Stored[Any]], labels: Mapping[str, str] = MappingProxyType({})) -> Html:
+    """Return the tables of records of one kind, with the operator's ``labels`` for names of captures; a warning names
+    those that are stale."""
+    if not found:
+        return Html("")
+    kind, shown = type(found[0].record), {each.label: each.record for each in found}
+    html = "".join(report_table(relabel(each, labels)) for each in kind.tables(shown))
+    if stale := ", ".join(each.label for each in found if each.stale):
+        html += paragraph(coloured(f"Out of date, made from what has changed since: {stale}.", "warning"))
+    return Html(html)
+
+
+def relabel(shown: Table, labels: Mapping[str, str]) -> Table:
+    """Return a table with the operator's labels for the names of captures."""
+    rows = [[use_labels(cell, labels) if isinstance(cell, str) else cell for cell in row] for row in shown.rows]
+    return replace(shown, rows=rows, notes=[use_labels(note, labels) for note in shown.notes])
+
+
+def use_labels(sentence: str, labels: Mapping[str, str]) -> str:
+    """Replace the captures' names in a sentence by the operator's labels."""
+    names = [re.escape(name) for name, label in labels.items() if label != name]
+    return re.sub(rf"(?<![\w.-])({'|'.join(names)})(?![\w-])", lambda m: labels[m[1]], sentence) if names else sentence
 
 
 def link(address: str, text: str) -> Html:

@@ -14,7 +14,7 @@ from slviewer.inspection.features import Feature, Kind
 from slviewer.inspection.quantities import Quantity
 from slviewer.inspection.starts import estimate_start, fit_plane_feature, fit_sphere_feature
 from slviewer.inspection.uncertainty import Shared, Spread, propagate_covariance, scatter_covariance
-from slviewer.records import to_plain
+from slviewer.records.plain import to_plain
 
 LEAST_POINTS = 50
 MAX_FITTED_POINTS = 20_000

@@ -25,7 +25,7 @@ from slviewer.pipeline.batch_tasks import (
 )
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
 from slviewer.pipeline.models import ModelName
-from slviewer.pipeline.verify import Shape, Verification
+from slviewer.records.verification import Shape, Verification
 
 INSTALL_COMMAND = "pip install 'slviewer[batch]'"
 CONNECT_TIMEOUT_S = 10.0
@@ -158,11 +158,11 @@ def _run_tasks(
 
 def _write_verifications(client: Any, done: Sequence[TaskResult], task: Task, warn: Warn) -> dict[str, str]:
     """Have each session's verifications written; {session: why it could not be done}."""
-    parts: dict[str, list[Verification]] = {}
+    parts: dict[str, dict[str, Verification]] = {}
     for one in done:
         if one.verification is not None:
-            parts.setdefault(one.session, []).append(one.verification)
-    writing = {address: (write_verification, address, tuple(verified), task) for address, verified in parts.items()}
+            parts.setdefault(one.session, {})[one.capture] = one.verification
+    writing = {address: (write_verification, address, verified, task) for address, verified in parts.items()}
     return {address: why for address, why in _gather_results(client, writing, ignore_progress, warn).items() if why}
 
 

@@ -3,7 +3,7 @@
 import json
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -14,8 +14,12 @@ import numpy as np
 from slviewer import __version__
 from slviewer.errors import InputError, SlviewerError
 from slviewer.pipeline.batch_storage import export_folder, fetch_session
-from slviewer.pipeline.reconstruct import reconstruct
-from slviewer.pipeline.verify import Shape, Verification, verify
+from slviewer.pipeline.models import ModelName
+from slviewer.pipeline.operation import Findings, Job
+from slviewer.pipeline.reconstruct import ReconstructSettings, reconstruct_capture
+from slviewer.pipeline.verify import VerifySettings, verify
+from slviewer.records.plain import to_plain
+from slviewer.records.verification import Shape, Verification
 from slviewer.session.atomic import write_bytes
 from slviewer.session.store import Session
 
@@ -32,7 +36,7 @@ class Task:
 
     do: Do
     batch: str
-    model: str | None = None
+    model: ModelName | None = None
     shape: Shape | None = None
     radius: float | None = None
     accept_rejected: bool = False
@@ -43,7 +47,7 @@ class Task:
 class TaskResult:
     """The result of one capture: its figures by name, or why it failed.
 
-    ``verification``: without its maps, to be joined with those of the session's other captures.
+    ``verification``: to be joined with those of the session's other captures.
     """
 
     session: str
@@ -88,11 +92,10 @@ def run_task(address: str, capture: str, task: Task) -> TaskResult:
     return replace(done, session=address, capture=capture, figures=figures, warnings=tuple(warnings))
 
 
-def write_verification(address: str, parts: Sequence[Verification], task: Task) -> None:
-    """Write the verifications of one session as one, as ``verify --json`` does."""
-    whole = Verification({name: comparison for part in parts for name, comparison in part.captures.items()})
+def write_verification(address: str, records: Mapping[str, Verification], task: Task) -> None:
+    """Write the verifications of one session, by capture, as ``verify --json`` does."""
     with export_folder(address, task.batch) as made:
-        text = json.dumps(whole.to_json(), indent=2) + "\n"
+        text = json.dumps(Findings(Verification, records).to_json(), indent=2, default=to_plain) + "\n"
         write_bytes(made / verification_file(task), text.encode())
 
 
@@ -114,15 +117,14 @@ def _check_version(version: str) -> None:
 
 def _reconstruct(store: Session, capture: str, task: Task, made: Path, warnings: list[str]) -> TaskResult:
     """Reconstruct a capture to a cloud or mesh in the folder ``made``, and return its figures."""
-    result = reconstruct(
-        store,
+    settings = ReconstructSettings(
         capture,
         model=task.model,
         out=made / "cloud.ply",
         mesh=task.do == "mesh",
         accept_rejected=task.accept_rejected,
-        warn=warnings.append,
     )
+    result = reconstruct_capture(Job(store, warn=warnings.append), settings)
     name = f"{capture}_{result.cloud.model}{'_mesh' if task.do == 'mesh' else ''}.ply"
     result.ply.rename(made / name)
     sigma = float(np.median(result.cloud.sigma_z[result.cloud.mask]))
@@ -132,33 +134,10 @@ def _reconstruct(store: Session, capture: str, task: Task, made: Path, warnings:
 def _verify(store: Session, capture: str, task: Task, warnings: list[str]) -> TaskResult:
     """Verify one capture of a plane or a sphere, and return its figures."""
     assert task.shape is not None
-    verification = verify(
-        store,
-        (capture,),
-        task.shape,
-        models=(task.model,) if task.model else (),
-        radius=task.radius,
-        accept_rejected=task.accept_rejected,
-        warn=warnings.append,
+    models = (task.model,) if task.model else ()
+    settings = VerifySettings(
+        (capture,), task.shape, models=models, radius=task.radius, accept_rejected=task.accept_rejected
     )
-    (comparison,) = verification.captures.values()
-    figures = {f"{model} RMS mm": result.rms_mm for model, result in comparison.results.items()}
-    return TaskResult("", "", figures, verification=_without_maps(verification))
-
-
-def _without_maps(verification: Verification) -> Verification:
-    """Return a copy with the figures for its JSON, without the arrays of one value per pixel."""
-    none = np.zeros((0, 0), bool)
-    captures = {
-        name: replace(
-            comparison,
-            region=none,
-            common=none,
-            results={
-                model: replace(result, error_map=none.astype(np.float32), inliers=none)
-                for model, result in comparison.results.items()
-            },
-        )
-        for name, comparison in verification.captures.items()
-    }
-    return replace(verification, captures=captures)
+    found = verify.run(store, settings, warn=warnings.append)[capture]
+    figures = {f"{model} RMS mm": fit.rms_mm for model, fit in found.models.items()}
+    return TaskResult("", "", figures, verification=found)

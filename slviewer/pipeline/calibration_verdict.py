@@ -16,7 +16,7 @@ from slviewer.fringe.sequence import PatternSequence
 from slviewer.pipeline.feedback import Progress
 from slviewer.pipeline.models import VERDICT, available_models, save_stereo, trash_models
 from slviewer.pipeline.poses import Judged, read_stored_poses
-from slviewer.records import from_plain
+from slviewer.records.plain import from_plain
 from slviewer.session.store import Session
 from slviewer.target.board import Board
 

@@ -30,7 +30,7 @@ from slviewer.pipeline.open_session import opened_or_made
 from slviewer.pipeline.rig_choice import RigSetup, SetUp, set_up
 from slviewer.pipeline.rig_presets import RigLike, load_rig
 from slviewer.pipeline.suggest_exposure import BUDGET_S, MAX_SUGGESTED, apply_suggestion, suggest_exposure
-from slviewer.records import to_plain
+from slviewer.records.plain import to_plain
 from slviewer.session.atomic import format_bytes
 from slviewer.session.capture import Capture, Role, TurnStep
 from slviewer.session.names import new_name

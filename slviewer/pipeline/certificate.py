@@ -38,11 +38,16 @@ from slviewer.pipeline.measurements import (
     load_measurements,
 )
 from slviewer.pipeline.models import MODELS, available_models, load_model, load_stereo_if_complete
-from slviewer.pipeline.open_session import SessionLike, numbered_results, opened
+from slviewer.pipeline.open_session import SessionLike, opened
+from slviewer.pipeline.operation import Job
+from slviewer.pipeline.operations import OPERATIONS
 from slviewer.pipeline.scale import load_scale_correction
-from slviewer.pipeline.verify import verify
-from slviewer.records import from_plain
-from slviewer.report.page import CERTIFICATE, Column, Section, Table, page_digest, split_page
+from slviewer.pipeline.stored_records import list_records, load_record
+from slviewer.records.kinds import RECORDS
+from slviewer.records.plain import from_plain
+from slviewer.records.table import Column, Table
+from slviewer.report.page import CERTIFICATE, Section, page_digest, split_page
+from slviewer.session.atomic import to_json
 from slviewer.session.decisions import REGION_INPUT
 from slviewer.session.measurements import Measurement
 from slviewer.session.nominal import NOMINALS, read_nominal
@@ -141,14 +146,15 @@ def make_certificate(store: Session) -> Certificate:
 
 
 def collect_figures(store: Session) -> Figures:
-    """Return the figures of the calibrations, verifications and measurements that are fresh."""
+    """Return the figures of the calibrations, records and measurements that are fresh."""
     figures: Figures = {}
     for name in available_models(store):
         if store.state_of(f"calibration/{name}") == "fresh":
             figures[f"calibration/{name}"] = _calibration_figures(store, name)
-    for name in numbered_results(store, "verify"):
-        if store.state_of(name) == "fresh":
-            figures[name] = _verification_figures(store.load_result(name, only=())[0]["models"])
+    for kind in RECORDS.values():
+        for each in list_records(store, kind):
+            if not each.stale:
+                figures[f"{kind.kind}/{each.name}"] = each.record.figures()
     for measured in load_measurements(store):
         if not measured.stale:
             figures[f"measurements/{measured.id}"] = _measurement_figures(measured)
@@ -162,8 +168,8 @@ def verify_report(session: SessionLike, report: Path | str, *, progress: Progres
         session: Session folder with the captures that the report was made from.
         report: The .html file that `report` wrote.
 
-    The page, every frame, calibration, verification and measurement is checked; what cannot be recomputed (merges, and
-    models whose file is gone) is listed. The session is not changed.
+    The page, every frame, calibration, record and measurement is checked; what cannot be recomputed (measurements on
+    merges, and models whose file is gone) is listed. The session is not changed.
     """
     page, certificate = read_certificate(expand_user(report))
     with opened(session) as store:
@@ -218,16 +224,6 @@ def _calibration_figures(store: Session, name: str) -> dict[str, float]:
     assert stereo is not None
     figures = {f"reprojection RMS {device}, px": rms for device, rms in stereo.reprojection_rms_px.items()}
     return figures | {"baseline, mm": stereo.baseline_mm}
-
-
-def _verification_figures(models: Mapping[str, Mapping[str, Any]]) -> dict[str, float]:
-    """Return the figures of a plane or sphere that was measured with each model."""
-    return {
-        f"{model} {key}": float(values[key])
-        for model, values in models.items()
-        for key in ("rms_mm", "noise_floor_mm", "radius_mm")
-        if values[key] is not None
-    }
 
 
 def _measurement_figures(measured: Measurement) -> dict[str, float]:
@@ -290,12 +286,8 @@ def _recompute(
         if "calibration/stereo" in certificate.figures:
             progress(0.1, "calibrating")
             _calibrate_again(store, fresh, why)
-        names = [name for name in certificate.figures if name.startswith("verify/")]
         figures = collect_figures(fresh)
-        for k, name in enumerate(names):
-            progress(0.6 + 0.2 * k / len(names), f"measuring {name.removeprefix('verify/')}")
-            with _note_failure(why, name):
-                figures[name] = _verify_again(store, fresh, name)
+        figures |= _run_again(store, fresh, certificate, why, progress)
         figures |= _measure_again(store, fresh, certificate, why, progress)
     return figures, why
 
@@ -350,12 +342,30 @@ def _repeat_calibration(
         )
 
 
-def _verify_again(store: Session, fresh: Session, result: str) -> dict[str, float]:
-    """Measure a plane or sphere again, with the models that were compared before; return its figures."""
-    name, meta = result.removeprefix("verify/"), store.load_result(result, only=())[0]
-    with Session.open(fresh.folder) as reading:  # nothing needs to be stored
-        found = verify(reading, [name], meta["shape"], models=list(meta["models"]), check=False)
-    return _verification_figures(found.captures[name].to_json()["models"])
+def _run_again(
+    store: Session, fresh: Session, certificate: Certificate, why: dict[str, str], progress: Progress
+) -> Figures:
+    """Run the operations that found the session's records again, with their settings; return the figures."""
+    runs: dict[tuple[str, bytes], list[str]] = {}
+    for result in certificate.figures:
+        kind, _, name = result.partition("/")
+        if kind not in RECORDS:
+            continue
+        record = load_record(store, RECORDS[kind], name)
+        if record.operation in OPERATIONS:
+            runs.setdefault((record.operation, to_json(record.settings)), []).append(result)
+        else:
+            why[result] = "an older version of slviewer made it: make it again, and write the report again"
+    figures: Figures = {}
+    for k, ((name, settings), results) in enumerate(runs.items()):
+        progress(0.6 + 0.2 * k / len(runs), f"repeating {name}")
+        operation = OPERATIONS[name]
+        with _note_failure(why, *results):
+            found = list(operation.find(Job(fresh), operation.settings(**msgspec.json.decode(settings))))
+            made = {f"{each.record.kind}/{each.name}": each.record.figures() for each in found}
+            numbered = len(results) == len(found) == 1  # its number here may be another
+            figures |= dict(zip(results, made.values(), strict=True)) if numbered else made
+    return figures
 
 
 def _measure_again(
@@ -473,7 +483,7 @@ def certificate_section(certificate: Certificate) -> Section:
     results = Table(
         [Column("result", align="left"), Column("hash", align="left")],
         [[name, certificate.results[name]] for name in certificate.figures],
-        "Calibrations, verifications and measurements",
+        "Calibrations, records and measurements",
     )
     software = Table(
         [Column("software", align="left"), Column("version", align="left")],

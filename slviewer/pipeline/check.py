@@ -17,7 +17,7 @@ from slviewer.pipeline.models import load_stereo, warn_if_stale
 from slviewer.pipeline.open_session import SessionLike, next_number, numbered_results, opened
 from slviewer.pipeline.poses import load_observations
 from slviewer.reconstruction.axis_agreement import check_sizes
-from slviewer.records import from_plain, to_plain
+from slviewer.records.plain import from_plain, to_plain
 from slviewer.session.store import Session
 from slviewer.target.board import Board
 from slviewer.target.detect import detect

@@ -17,7 +17,7 @@ from slviewer.pipeline.measured_surface import MeasuredSurface, load_surface
 from slviewer.pipeline.measurements import triangulate_surface
 from slviewer.pipeline.models import ModelName
 from slviewer.pipeline.open_session import SessionLike, opened
-from slviewer.records import to_plain
+from slviewer.records.plain import to_plain
 from slviewer.session.measurements import Measurement, save_measurement
 from slviewer.session.nominal import Nominal, Units, check_size, read_nominal
 from slviewer.session.ply import write_ply

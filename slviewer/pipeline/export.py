@@ -25,7 +25,7 @@ from slviewer.surface.meshing import MeshingPlan
 
 What = Literal["cloud", "mesh", "merge", "merged-mesh", "calibration", "coefficients", "poses", "report", "table"]
 """A scan's points, its mesh, the points of a merge, one mesh through them, the calibration, the coefficients of each
-pixel, poses of devices, boards and scans, the report, the verifications."""
+pixel, poses of devices, boards and scans, the report, the figures of all records."""
 _DOCUMENT_FORMATS: dict[str, tuple[str, ...]] = {
     "calibration": ("yml", "xml", "json"),
     "coefficients": ("npz",),
@@ -98,7 +98,7 @@ def check_export(what: What, file_format: str) -> None:
 
 def default_file_name(what: What, name: str, file_format: str) -> str:
     """The default name of an exported file, such as ``object_1_mesh.stl``."""
-    stems = {"cloud": f"{name}_cloud", "mesh": f"{name}_mesh", "merge": f"merged_{name}", "table": "verifications"}
+    stems = {"cloud": f"{name}_cloud", "mesh": f"{name}_mesh", "merge": f"merged_{name}", "table": "figures"}
     stems |= {"merged-mesh": f"merged_{name}_mesh", "coefficients": f"coefficients_{name}" if name else "coefficients"}
     return f"{stems.get(what, what)}.{file_format}"
 
@@ -123,7 +123,7 @@ def export(
         session: Session folder.
         what: cloud and mesh of a scan; merge (the points) and merged-mesh; calibration for OpenCV or as JSON;
             coefficients of each pixel as .npz; poses of camera, projector, target and scans as 4x4 matrices; report as
-            HTML; table of the verifications as CSV.
+            HTML; table of the figures of verifications, clouds and merges as CSV.
         name: The scan of a cloud or a mesh; the number of a merge, by default the last; the model of coefficients.
         out: The file, whose suffix selects the format, or a folder; by default the session's exports.
         file_format: ply, stl, obj, glb, 3mf, xyz, e57, yml, xml, json, ..., where --out is a folder or not given.
@@ -195,7 +195,7 @@ def _write_document(store: Session, what: What, name: str, target: Path, model: 
         write_poses(store, model or preferred_model(store), target)
         return "poses of the devices, the target and the scans"
     write_table(store, target)
-    return "verifications"
+    return "figures"
 
 
 def _resolve_name(store: Session, what: What, name: str) -> str:

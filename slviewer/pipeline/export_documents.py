@@ -1,4 +1,4 @@
-"""Documents of a session for other programs: the calibration, its coefficients, poses, verifications."""
+"""Documents of a session for other programs: the calibration, its coefficients, poses, figures."""
 
 from pathlib import Path
 from typing import Any
@@ -11,11 +11,13 @@ from slviewer.calibration.pixelwise import PixelwiseModel
 from slviewer.calibration.splined.model import SplinedModel
 from slviewer.errors import InputError
 from slviewer.geometry.rig import StereoRig
-from slviewer.pipeline.export_shapes import is_up_to_date
 from slviewer.pipeline.models import available_models, frame_of, load_model, load_stereo
-from slviewer.pipeline.open_session import numbered_results
 from slviewer.pipeline.scale import scale_factor
+from slviewer.pipeline.stored_records import Stored, list_records
 from slviewer.printable import format_csv
+from slviewer.records.kinds import RECORDS
+from slviewer.records.merge import Merge
+from slviewer.records.table import Value
 from slviewer.session.atomic import arriving_file, replace_file
 from slviewer.session.exporters import write_calibration
 from slviewer.session.names import natural_key
@@ -191,8 +193,8 @@ def write_poses(store: Session, model: str, path: Path) -> None:
     }
     if targets := _target_pose_entries(store, model):
         entries["targets"] = targets
-    if merges := numbered_results(store, "merge"):
-        entries["merges"] = [_merge_entry(store, name) for name in merges]
+    if merges := list_records(store, Merge):
+        entries["merges"] = [_merge_entry(store, each) for each in merges]
     write_calibration(path, entries, {name: meaning for name, meaning in _POSES.items() if name in entries})
 
 
@@ -217,18 +219,19 @@ def _target_pose_entries(store: Session, model: str) -> list[dict[str, Any]]:
     return targets
 
 
-def _merge_entry(store: Session, name: str) -> dict[str, Any]:
+def _merge_entry(store: Session, each: Stored[Merge]) -> dict[str, Any]:
     """Return a merge's scans with their transforms (4, 4) mm to the reference and their registration figures."""
-    meta = store.load_result(name, only=())[0]
-    used = str(meta.get("model", ""))
-    projector = np.linalg.inv(_projector_transform(store, used if used in available_models(store) else "stereo"))
+    made = each.record
+    projector = np.linalg.inv(
+        _projector_transform(store, made.model if made.model in available_models(store) else "stereo")
+    )
     scans = []
-    for scan in meta["scans"]:
-        pair = meta["pairs"].get(scan)
-        T = np.eye(4) if pair is None else np.array(pair["T_reference_scan"], float)
-        figures = {key: float(pair[key]) for key in _FIGURES if pair is not None and key in pair}
+    for scan in made.scans:
+        pair = made.pairs.get(scan)
+        T = np.eye(4) if pair is None else np.array(pair.T_reference_scan, float)
+        figures = {key: value for key in _FIGURES if (value := getattr(pair, key, None)) is not None}
         scans.append({"name": scan, "T_reference_scan": T, "T_reference_projector": T @ projector, **figures})
-    return {"name": name.removeprefix("merge/"), "reference": meta["reference"], "model": used, "scans": scans}
+    return {"name": each.name, "reference": made.reference, "model": made.model, "scans": scans}
 
 
 def _projector_transform(store: Session, model: str) -> np.ndarray:
@@ -250,22 +253,20 @@ def _scaled_transform(T: np.ndarray, factor: float) -> np.ndarray:
 
 
 def write_table(store: Session, path: Path) -> None:
-    """The captures of planes and spheres as each model measures them, as CSV."""
-    there, labels = set(store.capture_names()), store.decision("names") or {}
-    results = [name for name in numbered_results(store, "verify") if name.removeprefix("verify/") in there]
-    if not results:
-        raise InputError("nothing is verified yet: capture a plane or a sphere, and measure it in the step Verify")
-    figures = ["rms_mm", "noise_floor_mm", "radius_mm", "points", "set_aside", "coverage"]
-    ranges = ["R1", "R2", "R3"]
-    rows = [["capture", "name", "shape", "model", *figures, *(f"{r}_percent" for r in ranges), "up_to_date"]]
-    for result in results:
-        meta, name = store.load_result(result, only=())[0], result.removeprefix("verify/")
-        label, shares, fresh = (
-            str(labels.get(name, name)),
-            meta["incidence"] or {},
-            is_up_to_date(store, result),
-        )
-        for model, measured_by_model in meta["models"].items():
-            measured = [measured_by_model.get(each) for each in figures] + [shares.get(each) for each in ranges]
-            rows.append([name, label, meta["shape"], model, *measured, "yes" if fresh else "no"])
-    replace_file(path, format_csv(rows).encode())
+    """Write the tables of all records as one CSV: a line for each of theirs, the kind and whether it is up to date."""
+    every = [(kind, each) for kind in RECORDS.values() for each in list_records(store, kind)]
+    if not every:
+        raise InputError("nothing was found yet: verify, reconstruct or merge captures first")
+    rows: list[dict[str, Value]] = []
+    for kind, each in every:
+        for table in kind.tables({each.name: each.record}):
+            headings = [column.heading for column in table.columns]
+            start = {
+                "kind": kind.kind,
+                "record": each.name,
+                "label": each.label,
+                "up to date": "no" if each.stale else "yes",
+            }
+            rows += [{**start, **dict(zip(headings, table.values(row), strict=True))} for row in table.rows]
+    titles = list(dict.fromkeys(title for row in rows for title in row))
+    replace_file(path, format_csv([titles, *([row.get(title) for title in titles] for row in rows)]).encode())

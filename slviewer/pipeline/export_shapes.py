@@ -12,8 +12,9 @@ from slviewer.pipeline.capture_phases import capture_texture, decode_captures
 from slviewer.pipeline.feedback import Progress, Warn, part
 from slviewer.pipeline.models import frame_of, load_model, preferred_model
 from slviewer.pipeline.open_session import numbered_results
-from slviewer.pipeline.scale import describe_scale, scale_factor
+from slviewer.pipeline.scale import describe_scale
 from slviewer.pipeline.scan_edits import resolve_region, restrict_cloud, restriction_notes
+from slviewer.pipeline.stored_records import is_up_to_date
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.reconstruction.reconstruct import normals as grid_normals
 from slviewer.session.ply import Ply, read_ply
@@ -38,14 +39,6 @@ class DescribedShape:
         if isinstance(self.shape, Mesh):
             return f"{self.whose}: {'; '.join(self.done)}"
         return f"{self.whose}: {len(self.shape)} points"
-
-
-def is_up_to_date(store: Session, result: str) -> bool:
-    """Whether a result's inputs are as they were, and no correction of scale has changed since."""
-    if store.state_of(result) != "fresh":
-        return False
-    scales = store.load_result(result, only=())[0].get("scales", {})
-    return all(scale_factor(store, model) == factor for model, factor in scales.items())
 
 
 def scan_shape(

@@ -12,7 +12,7 @@ from slviewer.fringe.description_check import FrameReadings, check_description
 from slviewer.fringe.residual import FrameResidual, FrameResiduals, capture_residuals
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.fringe.suspect import Suspect
-from slviewer.records import from_plain, to_plain
+from slviewer.records.plain import from_plain, to_plain
 from slviewer.session.capture import Capture
 from slviewer.session.store import Session
 

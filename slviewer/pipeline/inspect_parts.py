@@ -16,7 +16,7 @@ from slviewer.pipeline.models import ModelName
 from slviewer.pipeline.open_session import match_names, next_number, opened
 from slviewer.pipeline.part_inspection import fail_part, inspect_part
 from slviewer.printable import format_csv
-from slviewer.records import to_plain
+from slviewer.records.plain import to_plain
 from slviewer.report.parts import write_parts_page
 from slviewer.session.atomic import replace_file, to_json
 from slviewer.session.inspection_plan import Plan, read_plan

@@ -24,7 +24,7 @@ from slviewer.pipeline.scale import scale_factor
 from slviewer.printable import format_csv
 from slviewer.reconstruction.mesh import triangulate_grid
 from slviewer.reconstruction.reconstruct import JUMP
-from slviewer.records import from_plain
+from slviewer.records.plain import from_plain
 from slviewer.session.atomic import replace_file
 from slviewer.session.measurements import (
     Measurement,

@@ -1,10 +1,10 @@
 """Registering scans of one object, and fusing them into one surface."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
@@ -14,18 +14,30 @@ from slviewer.geometry.rigid import rotation_angle
 from slviewer.pipeline.align import load_places
 from slviewer.pipeline.capture_clouds import capture_cloud, check_capture_sizes
 from slviewer.pipeline.capture_phases import capture_texture, decode_captures
-from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings, stage
-from slviewer.pipeline.models import ModelName, check_accepted, frame_of, load_model, preferred_model, warn_if_stale
-from slviewer.pipeline.open_session import SessionLike, next_number, opened, placed_file
+from slviewer.pipeline.feedback import Warn, stage
+from slviewer.pipeline.models import (
+    Model,
+    ModelName,
+    check_accepted,
+    frame_of,
+    load_model,
+    preferred_model,
+    warn_if_stale,
+)
+from slviewer.pipeline.open_session import next_number, placed_file
+from slviewer.pipeline.operation import Found, Job, operation
 from slviewer.pipeline.scale import describe_scale, scale_factor
 from slviewer.pipeline.scan_edits import resolve_region, restrict_cloud, restriction_notes
 from slviewer.reconstruction.cloud import Cloud
+from slviewer.records.merge import ContradictingPair, Loop, MarkerPair, Merge, RefusedPair, Registered
+from slviewer.records.plain import from_plain
 from slviewer.registration.markers import MeasuredMarkers, fit_marker_pose, marker_notes, measure_markers
 from slviewer.registration.multiway import Alignment, Pair, Starts
 from slviewer.registration.pairwise import Registration
 from slviewer.registration.picked import fit_picked_start
 from slviewer.registration.refusal import Refused
-from slviewer.registration.static_scene import ObjectAlignment, SceneContradiction, register_object
+from slviewer.registration.start import Candidate
+from slviewer.registration.static_scene import ObjectAlignment, register_object
 from slviewer.registration.turntable import TurntableAxis, shortest_turn
 from slviewer.session.ply import write_ply
 from slviewer.session.scan_edits import restriction_inputs
@@ -42,12 +54,9 @@ Picked = Mapping[Pair, tuple[np.ndarray, np.ndarray]]
 
 
 @dataclass(frozen=True, eq=False)
-class Merge:
-    """Scans aligned to one of them, the surface that they were fused to, and its file.
+class MergedScans:
+    """Scans aligned to one of them, the surface that they were fused to, and the record of it.
 
-    ``scale`` describes the correction of scale in it; ``result_name`` is the stored result, if any.
-    ``static_points``: by scan, how many points stand still while the object moves; ``contradictions`` of each pair.
-    ``restrictions``: edits and region that the scans were cut by, in words, and their hashes.
     In the file ``seen_by`` counts the scans that a point is the mean of, and ``source`` numbers the one that its place
     comes from, 0 for the first of ``fused.names``.
     """
@@ -55,136 +64,24 @@ class Merge:
     alignment: Alignment
     fused: Fused
     clouds: Mapping[str, Cloud]
-    out: Path
-    scale: str = ""
-    result_name: str = ""
-    static_points: Mapping[str, int] = field(default_factory=dict)
-    contradictions: Mapping[Pair, SceneContradiction] = field(default_factory=dict)
-    restrictions: tuple[str, ...] = ()
-    restriction_inputs: Mapping[str, str] = field(default_factory=dict)
+    found: Found[Merge]
 
     @property
-    def reference(self) -> str:
-        """The scan whose frame the surface is in."""
-        return self.alignment.reference
+    def record(self) -> Merge:
+        """The figures of the merge."""
+        return self.found.record
 
     @property
-    def pairs(self) -> Mapping[str, Registration]:
-        """The registration of every scan but the reference to it, by name."""
-        return self.alignment.on_reference()
-
-    def to_json(self) -> dict[str, Any]:
-        """The contract of ``merge --json``: every scan on the reference, every registered pair, the loops, what was
-        dropped or refused, and the surface."""
-        alignment = self.alignment
-        return {
-            "reference": alignment.reference,
-            "pairs": {name: _registration_figures(pair) for name, pair in self.pairs.items()},
-            "registered": [
-                {"scan": a, "onto": b, **_registration_figures(pair)} for (a, b), pair in alignment.pairs.items()
-            ],
-            "loops": [
-                {
-                    "scans": list(loop.names),
-                    "error_mm": loop.before.shift_mm,
-                    "error_deg": loop.before.turn_deg,
-                    "left_mm": loop.after.shift_mm,
-                    "left_deg": loop.after.turn_deg,
-                }
-                for loop in alignment.loops
-            ],
-            "dropped": [{"scan": a, "onto": b, "why": why} for (a, b), why in alignment.dropped.items()],
-            "refused": [{"scan": a, "onto": b, "why": why} for (a, b), why in alignment.refused.items()],
-            "markers": [
-                {"scan": a, "onto": b, "ids": list(pose.ids), "moved": list(pose.moved), "rms_mm": pose.rms_mm}
-                for (a, b), pose in alignment.markers.items()
-            ],
-            "static_points": dict(self.static_points),
-            "contradictions": [
-                {
-                    "scan": a,
-                    "onto": b,
-                    "share": contradiction.share,
-                    "compared": contradiction.compared,
-                    "gate_mm": contradiction.gate_mm,
-                }
-                for (a, b), contradiction in self.contradictions.items()
-            ],
-            "letter_rms_mm": dict(letter.EXPERIMENT_3_ICP_RMS_MM),
-            "points": len(self.fused.surface),
-            "shared": self.fused.shared,
-            "left_out": self.fused.excluded,
-        }
-
-    def text(self) -> str:
-        """A line a pair, the loop that closes worst, what was excluded, and the surface."""
-        alignment = self.alignment
-        r1, r2 = letter.EXPERIMENT_3_ICP_RMS_MM.values()
-        lines = [
-            f"{a} -> {b}: RMS {pair.rms_mm:.3f} mm, point to point {pair.inlier_rmse_mm:.3f} mm, "
-            f"overlap {100 * pair.overlap:.0f} %, standard deviations {1000 * pair.uncertainty.shift_mm:.1f} um "
-            f"and {pair.uncertainty.turn_deg:.4f} degrees"
-            for (a, b), pair in alignment.pairs.items()
-        ]
-        lines += [
-            f"{a} -> {b}: {len(pose.ids)} common markers, their corners {pose.rms_mm:.3f} mm apart (RMS)"
-            for (a, b), pose in alignment.markers.items()
-        ]
-        lines.append(f"(The Letter's three depths: point to point {r1:.2f} and {r2:.2f} mm.)")
-        if alignment.loops:
-            worst = alignment.loops[0]
-            way = " - ".join([*worst.names, worst.names[0]])
-            lines.append(
-                f"loop error, the worst of {len(alignment.loops)}: {worst.before.shift_mm:.3f} mm and "
-                f"{worst.before.turn_deg:.4f} degrees round {len(worst.names)} pairs ({way}); "
-                f"{max(loop.after.shift_mm for loop in alignment.loops):.3f} mm at most once closed"
-            )
-        lines += [f"excluded: {why}" for why in alignment.dropped.values()]
-        lines += [f"not registered: {a} -> {b}: {why}" for (a, b), why in alignment.refused.items()]
-        if self.contradictions:
-            worst_pair = max(self.contradictions.values(), key=lambda contradiction: contradiction.share)
-            lines.append(
-                f"contradicting points: {100 * worst_pair.share:.2g} % at most of what both scans of a pair cover lies "
-                f"more than {worst_pair.gate_mm:.2g} mm in front of the other's surface"
-            )
-        far = {name: counts["far"] for name, counts in self.fused.excluded.items() if counts.get("far")}
-        if far:
-            counted = ", ".join(f"{count} points of {name}" for name, count in far.items())
-            lines.append(f"removed as far from everything else: {counted}")
-        lines += self.restrictions
-        if self.scale:
-            lines.append(self.scale)
-        overlap_text = f"{100 * self.fused.shared:.0f} % of them seen by more than one scan"
-        lines.append(f"{len(self.fused.surface)} points, {overlap_text} -> {self.out}")
-        if self.result_name:
-            lines.append(f"the session stores it as {self.result_name}: mesh, compare and measure accept that name")
-        return "\n".join(lines)
+    def out(self) -> Path:
+        """The file of the surface."""
+        return self.found.files[0]
 
 
-def merge(
-    session: SessionLike,
-    captures: Sequence[str],
-    reference: str,
-    out: Path | str | None = None,
-    *,
-    model: ModelName | None = None,
-    start: StartKind = "features",
-    angle: float | None = None,
-    axis: TurntableAxis | None = None,
-    poses: Mapping[str, np.ndarray] | None = None,
-    picked: Picked | None = None,
-    keep_background: bool = False,
-    roi: str = "",
-    accept_rejected: bool = False,
-    progress: Progress = ignore_progress,
-    warn: Warn = ignore_warnings,
-) -> Merge:
-    """Register scans to a reference scan, close their loops, and fuse them into one surface.
-
-    Reports the uncertainty of each registered pair, how well loops close, and what was excluded, and why.
+@dataclass(frozen=True, eq=False)
+class MergeSettings:
+    """How scans are merged.
 
     Args:
-        session: Session folder.
         captures: Names of the captures, in the order in which they were captured.
         reference: The capture whose frame the merged cloud takes.
         out: PLY file. Without it the session stores the merge as merge/1 and so on, for mesh, compare, measure and
@@ -206,78 +103,137 @@ def merge(
     cameras' frames, that these pairs start from. The static background is separated from the moving object
     and excluded from the surface, unless ``keep_background``.
     """
-    given = list(dict.fromkeys(captures))
-    names = given if reference in given else [*given, reference]
-    if len(names) < 2:
-        raise UsageError(f"only {reference} was named: name the scans to merge with it")
-    if out is not None:
-        out = Path(out)
-        if out.suffix.lower() != ".ply":
-            raise UsageError(f"merged points are written as .ply, not as {out.name}: a mesh goes into other files too")
-        out.parent.mkdir(parents=True, exist_ok=True)  # or it fails now, not after minutes
-    if angle is not None and start != "turntable":
-        raise UsageError("an angle from scan to scan is that of a turntable: give --start turntable too, or neither")
-    table_deg = None if angle is None else {name: angle * k for k, name in enumerate(names)}
-    is_stored = start == "placed" or (start == "turntable" and angle is None)
-    if not is_stored:
-        starts = _initial_alignments(names, start, table_deg, axis, poses, picked, warn)
-    with opened(session, write=out is None) as store:
-        if is_stored:
-            poses = _load_places(store, names) if start == "placed" else poses
-            table_deg = _load_table_angles(store, names) if start == "turntable" else None
-            starts = _initial_alignments(names, start, table_deg, axis, poses, picked, warn)
-        check_accepted(store, accept_rejected)
-        fitted = load_model(store, model or preferred_model(store))
-        warn_if_stale(store, warn)
-        check_capture_sizes(store, names)
-        scale, clouds, region = describe_scale(store, fitted.name), {}, resolve_region(store, roi)
-        restrictions = restriction_notes(store, names, region)
-        inputs = restriction_inputs(store, names, with_region=not roi)
-        for i, (shot, frames, phases) in enumerate(decode_captures(store, names, warn)):
-            progress(0.4 * i / len(names), f"reconstructing {shot.name}")
-            cloud = capture_cloud(
-                store,
-                fitted,
-                shot,
-                phases,
-                texture=capture_texture(shot, frames, stretch=False),
-                accept_rejected=accept_rejected,
-                warn=warn,
+
+    UNRECORDED: ClassVar = ("out", "axis", "poses", "picked")
+    captures: Sequence[str]
+    reference: str
+    out: Path | str | None = None
+    model: ModelName | None = None
+    start: StartKind = "features"
+    angle: float | None = None
+    roi: str = ""
+    accept_rejected: bool = False
+    axis: TurntableAxis | None = None
+    poses: Mapping[str, np.ndarray] | None = None
+    picked: Picked | None = None
+    keep_background: bool = False
+
+    def __post_init__(self) -> None:
+        if len(self.names) < 2:
+            raise UsageError(f"only {self.reference} was named: name the scans to merge with it")
+        if self.out is not None and Path(self.out).suffix.lower() != ".ply":
+            name = Path(self.out).name
+            raise UsageError(f"merged points are written as .ply, not as {name}: a mesh goes into other files too")
+        if self.angle is not None and self.start != "turntable":
+            raise UsageError(
+                "an angle from scan to scan is that of a turntable: give --start turntable too, or neither"
             )
-            clouds[shot.name] = restrict_cloud(store, shot.name, cloud, region)
-        if start == "markers":
-            starts = replace(starts, markers=_measure_markers(clouds, warn))
-        elif table_deg is not None:
-            starts = replace(starts, markers=_measure_mat(clouds, table_deg, warn))
-        registered = register_object(clouds, reference, starts, stage(progress, 0.4, 0.75, "registering"))
-        alignment = registered.alignment
-        for why in [
-            *_list_moved_markers(alignment),
-            *alignment.dropped.values(),
-            *_scene_warnings(clouds, registered, keep_background),
-        ]:
-            warn(why)
-        clouds = clouds if keep_background else dict(registered.clouds)
-        left = {name: (each.covariance, each.centre) for name, each in alignment.uncertainties.items()}
-        fused = fuse(clouds, alignment.T_reference_scan, stage(progress, 0.75, 0.9, "fusing"), left)
-        progress(0.9, "writing")
-        surface = fused.surface
-        scalars = {} if surface.sigma_mm is None else {"sigma": surface.sigma_mm}
-        scalars |= {"seen_by": fused.seen_by, "source": fused.source}
-        frame = f"{frame_of(store, fitted.name)}, at {reference}"
-        notes = (f"scans {', '.join(names)}, frame: {frame}", f"calibration {fitted.name}", *restrictions)
-        static_points = {name: int(mask.sum()) for name, mask in registered.static.items()}
-        number = 0 if out is not None else next_number(store, "merge")
-        with placed_file(store, out, f"merged_{number}.ply") as (path, written):
-            write_ply(written, surface.points, surface.colours, surface.normals, scalars, notes=notes)
-            result = Merge(
-                alignment, fused, clouds, path, scale, f"merge/{number}" if number else "", static_points,
-                registered.contradictions, restrictions, inputs,
-            )  # fmt: skip
-            if result.result_name:
-                store.save_result(result.result_name, _make_record(store, result, fitted.name), {})
-    progress(1.0, "merged")
-    return result
+
+        self.fit_picks()
+
+    def fit_picks(self) -> dict[Pair, tuple[Candidate, np.ndarray]]:
+        """Return what the picked points give for each pair, and how far they then are apart, mm."""
+        picks = {}
+        for (scan, onto), (there, here) in (self.picked or {}).items():
+            if not {scan, onto} <= set(self.names):
+                raise UsageError(
+                    f"points were picked on {scan} and {onto}, which are not both among the scans to merge"
+                )
+            picks[scan, onto] = fit_picked_start(there, here)
+        return picks
+
+    @property
+    def names(self) -> list[str]:
+        """The captures and the reference, each once."""
+        given = list(dict.fromkeys(self.captures))
+        return given if self.reference in given else [*given, self.reference]
+
+
+@operation("merge", Merge, MergeSettings)
+def merge(job: Job, settings: MergeSettings) -> Iterator[Found[Merge]]:
+    """Register scans to a reference scan, close their loops, and fuse them into one surface.
+
+    Reports the uncertainty of each registered pair, how well loops close, and what was excluded, and why.
+    """
+    yield merge_scans(job, settings).found
+
+
+def merge_scans(job: Job, settings: MergeSettings) -> MergedScans:
+    """Register and fuse scans, and write the file of the merge; the session stores nothing else."""
+    store, names, warn = job.store, settings.names, job.warn
+    if settings.out is not None:
+        Path(settings.out).parent.mkdir(parents=True, exist_ok=True)  # or it fails now, not after minutes
+    table_deg = _list_table_angles(store, settings)
+    starts = _initial_alignments(store, settings, table_deg, warn)
+    check_accepted(store, settings.accept_rejected)
+    fitted = load_model(store, settings.model or preferred_model(store))
+    warn_if_stale(store, warn)
+    check_capture_sizes(store, names)
+    clouds = _reconstruct_scans(job, settings, fitted)
+    if settings.start == "markers":
+        starts = replace(starts, markers=_measure_markers(clouds, warn))
+    elif table_deg is not None:
+        starts = replace(starts, markers=_measure_mat(clouds, table_deg, warn))
+    registered = register_object(clouds, settings.reference, starts, stage(job.progress, 0.4, 0.75, "registering"))
+    alignment = registered.alignment
+    moved, background = _list_moved_markers(alignment), settings.keep_background
+    for why in [*moved, *alignment.dropped.values(), *_scene_warnings(clouds, registered, background)]:
+        warn(why)
+    clouds = clouds if background else dict(registered.clouds)
+    left = {name: (each.covariance, each.centre) for name, each in alignment.uncertainties.items()}
+    fused = fuse(clouds, alignment.T_reference_scan, stage(job.progress, 0.75, 0.9, "fusing"), left)
+    job.progress(0.9, "writing")
+    found = _write_merge(store, settings, fitted.name, registered, fused)
+    job.progress(1.0, "merged")
+    return MergedScans(alignment, fused, clouds, found)
+
+
+def _reconstruct_scans(job: Job, settings: MergeSettings, fitted: Model) -> dict[str, Cloud]:
+    """Return the cloud of each scan without what edits and region remove."""
+    store, names, region, clouds = job.store, settings.names, resolve_region(job.store, settings.roi), {}
+    for i, (shot, frames, phases) in enumerate(decode_captures(store, names, job.warn)):
+        job.progress(0.4 * i / len(names), f"reconstructing {shot.name}")
+        texture = capture_texture(shot, frames, stretch=False)
+        accepted = settings.accept_rejected
+        cloud = capture_cloud(store, fitted, shot, phases, texture=texture, accept_rejected=accepted, warn=job.warn)
+        clouds[shot.name] = restrict_cloud(store, shot.name, cloud, region)
+    return clouds
+
+
+def _write_merge(
+    store: Session, settings: MergeSettings, model: str, registered: ObjectAlignment, fused: Fused
+) -> Found[Merge]:
+    """Write the surface of a merge as PLY; returns its record, which is stored unless the file has a place of its
+    own."""
+    surface, names, scale = fused.surface, settings.names, describe_scale(store, model)
+    restrictions = restriction_notes(store, names, resolve_region(store, settings.roi))
+    scalars = {} if surface.sigma_mm is None else {"sigma": surface.sigma_mm}
+    scalars |= {"seen_by": fused.seen_by, "source": fused.source}
+    frame = f"{frame_of(store, model)}, at {settings.reference}"
+    notes = (f"scans {', '.join(names)}, frame: {frame}", f"calibration {model}", *restrictions)
+    number = next_number(store, "merge") if settings.out is None else 0
+    with placed_file(store, settings.out, f"merged_{number}.ply") as (path, written):
+        write_ply(written, surface.points, surface.colours, surface.normals, scalars, notes=notes)
+    calibrations = dict.fromkeys(("calibration/stereo", f"calibration/{model}"))
+    cuts = restriction_inputs(store, names, with_region=not settings.roi)
+    record = _make_record(
+        registered,
+        fused,
+        ply=path.name,
+        model=model,
+        scale=scale,
+        restrictions=list(restrictions),
+        scales={model: scale_factor(store, model)},
+        inputs={**store.input_hashes(*fused.names, *calibrations), **cuts},
+    )
+    r1, r2 = letter.EXPERIMENT_3_ICP_RMS_MM.values()
+    said = [
+        f"(The Letter's three depths: point to point {r1:.2f} and {r2:.2f} mm.)",
+        f"{record.points:,} points -> {path}",
+    ]
+    if number:
+        said.append(f"the session stores it as merge/{number}: mesh, compare and measure accept that name")
+    return Found(str(number or path.stem), record, {}, (path,), tuple(said), stored=bool(number))
 
 
 def _measure_markers(clouds: Mapping[str, Cloud], warn: Warn) -> dict[str, MeasuredMarkers]:
@@ -361,24 +317,66 @@ def _scene_warnings(clouds: Mapping[str, Cloud], registered: ObjectAlignment, ke
     return messages
 
 
-def _make_record(store: Session, merged: Merge, model: str) -> dict[str, Any]:
-    """Return the stored record of a merge made with that model: its figures, its file in the exports, and its
-    inputs."""
-    calibrations = dict.fromkeys(("calibration/stereo", f"calibration/{model}"))
-    return {
-        **merged.to_json(),
-        "scans": list(merged.fused.names),
-        "ply": merged.out.name,
-        "model": model,
-        "scale": merged.scale,
-        "scales": {model: scale_factor(store, model)},
-        "restrictions": list(merged.restrictions),
-        "inputs": {**store.input_hashes(*merged.fused.names, *calibrations), **merged.restriction_inputs},
-    }
+def _make_record(registered: ObjectAlignment, fused: Fused, **origin: Any) -> Merge:
+    """Return the record of a merge; ``origin``: its file, calibration, restrictions and inputs."""
+    alignment = registered.alignment
+    return Merge(
+        reference=alignment.reference,
+        scans=list(fused.names),
+        pairs={scan: _make_registered(scan, alignment.reference, r) for scan, r in alignment.on_reference().items()},
+        points=len(fused.surface),
+        registered=[_make_registered(*pair, registration) for pair, registration in alignment.pairs.items()],
+        loops=[
+            Loop(list(loop.names), loop.before.shift_mm, loop.before.turn_deg, loop.after.shift_mm, loop.after.turn_deg)
+            for loop in alignment.loops
+        ],
+        dropped=[RefusedPair(*pair, why) for pair, why in alignment.dropped.items()],
+        refused=[RefusedPair(*pair, why) for pair, why in alignment.refused.items()],
+        markers=[
+            MarkerPair(*pair, list(pose.ids), list(pose.moved), pose.rms_mm) for pair, pose in alignment.markers.items()
+        ],
+        static_points={name: int(mask.sum()) for name, mask in registered.static.items()},
+        contradictions=[
+            ContradictingPair(*pair, each.share, each.compared, each.gate_mm)
+            for pair, each in registered.contradictions.items()
+        ],
+        left_out={name: dict(counts) for name, counts in fused.excluded.items()},
+        shared=fused.shared,
+        **origin,
+    )
 
 
-def _load_table_angles(store: Session, names: Sequence[str]) -> dict[str, float]:
-    """Return the turntable's angle, deg, of scans of a single turn. Raises UsageError for others."""
+def _make_registered(scan: str, onto: str, registration: Registration) -> Registered:
+    """Return the figures of a registration."""
+    uncertainty = registration.uncertainty
+    return from_plain(
+        {
+            "scan": scan,
+            "onto": onto,
+            "rms_mm": registration.rms_mm,
+            "point_to_point_rms_mm": registration.inlier_rmse_mm,
+            "overlap": registration.overlap,
+            "agreement": registration.agreement,
+            "slack_mm": registration.slack_mm,
+            "gate_mm": registration.gate_mm,
+            "start": registration.start,
+            "sigma_shift_mm": uncertainty.shift_mm,
+            "sigma_turn_deg": uncertainty.turn_deg,
+            "middle": uncertainty.centre.tolist(),
+            "T_reference_scan": registration.T_reference_scan.tolist(),
+        },
+        Registered,
+    )
+
+
+def _list_table_angles(store: Session, settings: MergeSettings) -> dict[str, float] | None:
+    """Return the turntable's angle, deg, of each scan, of a single turn where they are stored with the captures; None
+    where the merge does not start from them. Raises UsageError where they are not known."""
+    names = settings.names
+    if settings.start != "turntable":
+        return None
+    if settings.angle is not None:
+        return {name: settings.angle * k for k, name in enumerate(names)}
     stored = {name: store.load_capture(name).turn_step for name in names}
     table_deg = {name: step.deg for name, step in stored.items() if step is not None}
     if missing := [name for name in names if name not in table_deg]:
@@ -395,41 +393,19 @@ def _load_table_angles(store: Session, names: Sequence[str]) -> dict[str, float]
 
 
 def _initial_alignments(
-    names: Sequence[str],
-    start: StartKind,
-    table_deg: Mapping[str, float] | None,
-    axis: TurntableAxis | None,
-    poses: Mapping[str, np.ndarray] | None,
-    picked: Picked | None,
-    warn: Warn,
+    store: Session, settings: MergeSettings, table_deg: Mapping[str, float] | None, warn: Warn
 ) -> Starts:
     """Return the initial alignments for the requested start; raises for options that do not fit it."""
-    if start == "identity" and poses is None:
+    names, poses = settings.names, settings.poses
+    if settings.start == "placed":
+        poses = _load_places(store, names)
+    elif settings.start == "identity" and poses is None:
         poses = {name: np.eye(4) for name in names}
     picks = {}
-    for (scan, onto), (there, here) in (picked or {}).items():
-        if not {scan, onto} <= set(names):
-            raise UsageError(f"points were picked on {scan} and {onto}, which are not both among the scans to merge")
-        picks[scan, onto], apart = fit_picked_start(there, here)
+    for (scan, onto), (pick, apart) in settings.fit_picks().items():
+        picks[scan, onto] = pick
         warn(f"{scan} -> {onto}: the picked points come within {apart.max():.2f} mm of each other")
     for base in {onto for _, onto in picks} if poses is None and table_deg is None else ():
         if all((name, base) in picks for name in names if name != base):  # pairs without picked points start there too
             poses = {base: np.eye(4)} | {name: picks[name, base].T for name in names if name != base}
-    return Starts(poses=poses, table_deg=table_deg, axis=axis, picked=picks)
-
-
-def _registration_figures(registration: Registration) -> dict[str, Any]:
-    """Return a registration's figures by name, as plain values for JSON."""
-    return {
-        "rms_mm": registration.rms_mm,
-        "point_to_point_rms_mm": registration.inlier_rmse_mm,
-        "overlap": registration.overlap,
-        "agreement": registration.agreement,
-        "slack_mm": registration.slack_mm,
-        "gate_mm": registration.gate_mm,
-        "start": registration.start,
-        "sigma_shift_mm": registration.uncertainty.shift_mm,
-        "sigma_turn_deg": registration.uncertainty.turn_deg,
-        "middle": registration.uncertainty.centre.tolist(),
-        "T_reference_scan": registration.T_reference_scan.tolist(),
-    }
+    return Starts(poses=poses, table_deg=table_deg, axis=settings.axis, picked=picks)

@@ -11,12 +11,15 @@ from slviewer.errors import InputError, UsageError
 from slviewer.pipeline.export import check_export
 from slviewer.pipeline.export_shapes import merge_name, merged_points, scan_cloud
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings, part, stage
-from slviewer.pipeline.merge import Merge, StartKind, merge
+from slviewer.pipeline.merge import MergedScans, MergeSettings, StartKind, merge_scans
 from slviewer.pipeline.models import ModelName, check_accepted, load_stereo, warn_if_stale
 from slviewer.pipeline.open_session import SessionLike, opened
+from slviewer.pipeline.operation import Findings, Job, show_found
 from slviewer.pipeline.scan_edits import OFF, refuse_region, resolve_region, restriction_notes
+from slviewer.pipeline.stored_records import load_record
 from slviewer.pipeline.white_balance import balance, measure_white
 from slviewer.reconstruction.cloud import Cloud
+from slviewer.records.merge import Merge
 from slviewer.session.mesh_files import write_shape, write_textured
 from slviewer.session.store import Session
 from slviewer.surface.meshing import BuiltMesh, MeshingPlan, build_mesh
@@ -37,7 +40,7 @@ class MeshResult:
     meshed: BuiltMesh
     sources: tuple[str, ...]
     out: Path
-    merged: Merge | None = None
+    merged: Findings[Merge] | None = None
     textured: TexturedMesh | None = None
 
     def to_json(self) -> dict[str, Any]:
@@ -117,29 +120,30 @@ def mesh(
         shape: Cloud | PointSet
         if len(sources) > 1:
             points = path.with_name(f"{path.stem}_points.ply")
-            merged = merge(
-                store, sources, sources[0], points, model=model, start=start, angle=angle,
-                roi=roi, accept_rejected=accept_rejected, progress=before, warn=warn,
-            )  # fmt: skip
-            shape, restrictions = merged.fused.surface, merged.restrictions
+            settings = MergeSettings(
+                sources, sources[0], points, model, start, angle, roi=roi, accept_rejected=accept_rejected
+            )
+            merged = merge_scans(Job(store, before, warn), settings)
+            shape, restrictions = merged.fused.surface, tuple(merged.record.restrictions)
         elif sources[0].startswith(MERGE):
             refuse_region(sources[0], roi)
             name = merge_name(store, sources[0].removeprefix(MERGE))
             shape = merged_points(store, name, warn)
-            restrictions = tuple(store.load_result(f"{MERGE}{name}", only=())[0].get("restrictions", ()))
+            restrictions = tuple(load_record(store, Merge, name).restrictions)
         else:
             warn_if_stale(store, warn)
             shape = scan_cloud(store, sources[0], model, before, warn, accept_rejected, roi)
             restrictions = restriction_notes(store, sources, resolve_region(store, roi))
         scans = {} if texture is None else _textured_scans(store, sources, shape, merged, model, warn, accept_rejected)
         light = None if texture is None else _projector_place(store)
+    merging = None if merged is None else show_found(merged.found)
     meshed = build_mesh(shape, plan, part(progress, 0.5, 0.95 if texture is None else 0.6))
     notes = (f"of {', '.join(sources)}", *restrictions, *meshed.text().splitlines())
     if texture is None:
         progress(0.95, f"writing {path.name}")
         write_shape(path, meshed.mesh, notes=notes)
         progress(1.0, "meshed")
-        return MeshResult(meshed, sources, path, merged)
+        return MeshResult(meshed, sources, path, merging)
     clouds, poses = {name: each[0] for name, each in scans.items()}, {name: each[1] for name, each in scans.items()}
     if gains is not None:
         clouds = {name: _balance_cloud(name, cloud, gains) for name, cloud in clouds.items()}
@@ -148,14 +152,14 @@ def mesh(
     progress(0.95, f"writing {path.name}")
     write_textured(path, textured.mesh, textured.uv, textured.image, (*notes, textured.text()))
     progress(1.0, "meshed")
-    return MeshResult(meshed, sources, path, merged, textured)
+    return MeshResult(meshed, sources, path, merging, textured)
 
 
 def _textured_scans(
     store: Session,
     sources: Sequence[str],
     shape: Cloud | PointSet,
-    merged: Merge | None,
+    merged: MergedScans | None,
     model: ModelName | None,
     warn: Warn,
     accept_rejected: bool,
@@ -166,13 +170,13 @@ def _textured_scans(
         return {name: (merged.clouds[name], poses[name]) for name in merged.fused.names}
     if isinstance(shape, Cloud):
         return {sources[0]: (shape, np.eye(4))}
-    meta = store.load_result(f"{MERGE}{merge_name(store, sources[0].removeprefix(MERGE))}", only=())[0]
-    placed = {name: np.array(pair["T_reference_scan"], np.float64) for name, pair in meta["pairs"].items()}
-    placed |= {meta["reference"]: np.eye(4)}
-    used = meta.get("model") or model
+    made = load_record(store, Merge, merge_name(store, sources[0].removeprefix(MERGE)))
+    placed = {name: np.array(pair.T_reference_scan, np.float64) for name, pair in made.pairs.items()}
+    placed |= {made.reference: np.eye(4)}
+    used = made.model or model
     return {  # what lies outside of the region still hides the surface from a scan
         name: (scan_cloud(store, name, used, ignore_progress, warn, accept_rejected, OFF), placed[name])
-        for name in meta["scans"]
+        for name in made.scans
     }
 
 

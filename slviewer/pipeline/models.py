@@ -17,7 +17,7 @@ from slviewer.geometry.lens import Lens
 from slviewer.geometry.rig import StereoRig
 from slviewer.pipeline.feedback import Warn
 from slviewer.pipeline.open_session import SessionLike, opened
-from slviewer.records import from_plain
+from slviewer.records.plain import from_plain
 from slviewer.session.reading import decoding
 from slviewer.session.store import Session
 from slviewer.target.board import Board

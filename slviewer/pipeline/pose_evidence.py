@@ -12,7 +12,7 @@ from slviewer.calibration.observe import Observation, pitch_px
 from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.pipeline.frame_check import FrameCheck
-from slviewer.records import to_plain
+from slviewer.records.plain import to_plain
 from slviewer.session.capture import Capture
 from slviewer.session.store import Session
 from slviewer.target.board import Board

@@ -1,8 +1,9 @@
 """From a capture to a cloud."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis
 from slviewer.pipeline.capture_clouds import absolute_phases, capture_cloud, check_capture_sizes
 from slviewer.pipeline.capture_phases import capture_texture, decode_captures
-from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
+from slviewer.pipeline.feedback import Warn, ignore_warnings
 from slviewer.pipeline.models import (
     Model,
     ModelName,
@@ -24,94 +25,44 @@ from slviewer.pipeline.models import (
     preferred_model,
     warn_if_stale,
 )
-from slviewer.pipeline.open_session import SessionLike, opened_to_save, placed_file
+from slviewer.pipeline.open_session import placed_file
+from slviewer.pipeline.operation import Found, Job, operation, plain_settings
 from slviewer.pipeline.scale import describe_scale, scale_factor
 from slviewer.pipeline.scan_edits import resolve_region, restrict_cloud, restriction_notes
 from slviewer.reconstruction.cloud import Cloud, choose_pixels
 from slviewer.reconstruction.mesh import triangulate_grid
 from slviewer.reconstruction.reconstruct import JUMP, normals
+from slviewer.records.reconstruction import Reconstruction
+from slviewer.records.table import render_text
+from slviewer.records.verification import Verification
 from slviewer.session.capture import Capture
 from slviewer.session.ply import write_ply
 from slviewer.session.store import Session
 from slviewer.target.board import Board
 from slviewer.target.detect import board_mask, detect
 
-REPORTED_RAISE = 1.2
-"""Times its predicted noise that a calibration's residual is, from which raising sigma is reported."""
 
-
-@dataclass(frozen=True)
-class Reconstruction:
-    """A reconstructed capture, the phases it came from, the file it went to, and for a board pose how flat each model
-    measures the board. ``scale`` describes the correction of scale in it; ``masked`` is the share of the
-    pixels that were masked because no target pose illuminated what they look through, None for models that mask none.
-    ``frame``: the one that the points are in, in words. ``raised``: the calibration's residuals over their predicted
-    noise, by which sigmas are raised. ``restrictions`` describes the edits and the region that it was cut by.
+@dataclass(frozen=True, eq=False)
+class ReconstructedCapture:
+    """A reconstructed capture: what is stored of it; its cloud without what edits and region remove; the phases that it
+    came from; its PLY file with ``points`` points; for a board pose how flat each model measures the board.
+    ``restrictions`` describes edits and region.
     """
 
+    found: Found[Reconstruction]
     cloud: Cloud
     phases: Mapping[Axis, PhaseMap]
     ply: Path
     points: int
     board: Comparison | None = None
-    scale: str = ""
-    masked: float | None = None
-    frame: str = ""
-    raised: float = 1.0
     restrictions: tuple[str, ...] = ()
 
-    def text(self) -> str:
-        """Return the result as a report for the terminal."""
-        cloud = self.cloud
-        z, sigma = cloud.points[..., 2][cloud.mask], cloud.sigma_z[cloud.mask]
-        lines = [
-            f"{self.points} points by {cloud.model} from axis {cloud.axis}, z {np.percentile(z, 1):.0f}-"
-            f"{np.percentile(z, 99):.0f} mm, predicted depth noise {np.median(sigma):.3f} mm -> {self.ply}"
-        ]
-        if cloud.sigma_calibration is not None:
-            sigma_z = cloud.sigma_calibration[cloud.mask]
-            lines.append(
-                f"apart from a rigid motion, the calibration leaves {np.median(sigma_z):.4f} mm of depth uncertain in "
-                f"the median, {np.percentile(sigma_z, 95):.4f} mm at 95 % (1 sigma)"
-            )
-        if self.raised > REPORTED_RAISE:
-            lines.append(
-                f"sigma was raised: the calibration's residuals in {cloud.axis} are {self.raised:.1f} times their "
-                "predicted noise, and what disturbs its phases disturbs this capture's as well"
-            )
-        lines += self.restrictions
-        if self.frame:
-            lines.append(f"frame: {self.frame}")
-        if self.scale:
-            lines.append(self.scale)
-        if self.masked is not None and self.masked > 0.005:
-            lines.append(f"{100 * self.masked:.1f} % of the pixels are masked: they lie outside the calibrated region")
-        if self.board is not None:
-            lines += ["inside the board's outline:", self.board.text()]
-        return "\n".join(lines)
 
-
-def reconstruct(
-    session: SessionLike,
-    capture: str,
-    *,
-    model: ModelName | None = None,
-    axis: Axis | None = None,
-    depth_range: tuple[float, float] | None = None,
-    out: Path | str | None = None,
-    grid: Path | str | None = None,
-    mesh: bool = False,
-    roi: str = "",
-    accept_rejected: bool = False,
-    check: bool = True,
-    progress: Progress = ignore_progress,
-    warn: Warn = ignore_warnings,
-) -> Reconstruction:
-    """Reconstruct a capture as a cloud, and store it in the session; for a board pose also how flat each model measures
-    the board.
+@dataclass(frozen=True)
+class ReconstructSettings:
+    """How a capture is reconstructed.
 
     Args:
-        session: Session folder.
         capture: Name of the capture.
         model: Which calibration to use, here and by what then works on this cloud; by default the best one available.
         axis: Which pattern axis gives the depth; by default the one with the smaller predicted noise.
@@ -127,85 +78,104 @@ def reconstruct(
 
     ``check``: also compare the frames with each other, and warn of those that do not fit.
     """
-    for path, suffix in ((out, ".ply"), (grid, ".npy")):
-        if path is not None and Path(path).suffix.lower() != suffix:
-            raise InputError(
-                f"{path}: a cloud is written as .ply (--out), its whole grid as .npy (--grid): end its name in "
-                f"{suffix}; `slviewer export` writes other formats"
-            )
-    with opened_to_save(session, warn) as store:
-        check_accepted(store, accept_rejected)
-        name = model or preferred_model(store)
-        warn_if_stale(store, warn)
-        check_capture_sizes(store, [capture])
-        progress(0.1, "reading and decoding")
-        shot, frames, decoded = next(decode_captures(store, [capture], warn, relative=True, check=check))
-        phases = absolute_phases(store, capture, decoded, depth_range, warn)
-        is_pose = shot.role == "calibration"
-        texture = capture_texture(shot, frames, stretch=is_pose)
-        chosen = load_models(store, () if is_pose and model is None else (name,))
-        progress(0.6, "reconstructing")
-        clouds = {
-            n: capture_cloud(
-                store, m, shot, phases, axis=axis, texture=texture, accept_rejected=accept_rejected, warn=warn
-            )
-            for n, m in chosen.items()
-        }
-        cloud = uncut = clouds[name]
-        box = None if is_pose else resolve_region(store, roi)
-        cloud = cloud if is_pose else restrict_cloud(store, capture, cloud, box)
-        restrictions = () if is_pose else restriction_notes(store, [capture], box)
-        region = segment_board(store, shot, texture, warn) if is_pose else None
-        board = None
-        if region is not None:
-            depth_range = load_stereo(store).depth_range_mm
-            board = compare("plane", clouds, illuminated_pixels(phases, clouds), region=region, depth_range=depth_range)
-        mask = cloud.mask if region is None else cloud.mask & region
-        if not mask.any():
-            raise InputError(
-                f"{capture}: no pixel could be reconstructed with {name}: does the calibration belong to this camera "
-                "and projector, and is the scene within its depths?"
-            )
-        progress(0.8, "writing")
-        faces = triangulate_points(cloud.points, mask) if mesh else None
-        notes = (f"scan {capture}, frame: {frame_of(store, name)}", f"calibration {name}", *restrictions)
-        scale, fitted, frame = describe_scale(store, name), chosen[name], frame_of(store, name)
-        masked = masked_share(fitted, phases[cloud.axis], region)
-        raised = fitted.residuals_over_noise(cloud.axis) if isinstance(fitted, SplinedModel) else 1.0
-        with placed_file(store, out, f"{capture}_{name}{'_mesh' if mesh else ''}.ply") as (ply, written):
-            write_ply(
-                written,
-                choose_pixels(cloud.points, mask),
-                texture[mask],
-                normals(cloud.points)[mask],
-                cloud.sigmas(mask),
-                faces,
-                notes,
-            )
-            if grid is not None:
-                write_grid(Path(grid), cloud.points)
-            if store.is_writable:
-                progress(0.95, "storing")
-                save_cloud(store, capture, uncut, phases[cloud.axis], masked)
-        progress(1.0, "reconstructed")
-    count = int(np.count_nonzero(mask))
-    return Reconstruction(cloud, phases, ply, count, board, scale, masked, frame, raised, restrictions)
+
+    UNRECORDED: ClassVar = ("out", "grid", "mesh", "roi", "check")
+    capture: str
+    model: ModelName | None = None
+    axis: Axis | None = None
+    depth_range: tuple[float, float] | None = None
+    out: Path | str | None = None
+    grid: Path | str | None = None
+    mesh: bool = False
+    roi: str = ""
+    accept_rejected: bool = False
+    check: bool = True
+
+    def __post_init__(self) -> None:
+        for path, suffix in ((self.out, ".ply"), (self.grid, ".npy")):
+            if path is not None and Path(path).suffix.lower() != suffix:
+                raise InputError(
+                    f"{path}: a cloud is written as .ply (--out), its whole grid as .npy (--grid): end its name in "
+                    f"{suffix}; `slviewer export` writes other formats"
+                )
 
 
-def save_cloud(store: Session, capture: str, cloud: Cloud, phase: PhaseMap, masked: float | None) -> None:
-    """Store a capture's cloud, before edits and region, as ``clouds/<capture>``; ``masked``: see `Reconstruction`."""
+@operation("reconstruct", Reconstruction, ReconstructSettings)
+def reconstruct(job: Job, settings: ReconstructSettings) -> Iterator[Found[Reconstruction]]:
+    """Reconstruct a capture as a cloud, and write it as PLY; for a board pose also how flat each model measures the
+    board."""
+    made = reconstruct_capture(job, settings)
+    notes = (*made.restrictions, f"{made.points:,} points -> {made.ply}")
+    if made.board is not None:
+        tables = Verification.tables({settings.capture: made.board.record()})
+        notes += ("inside the board's outline:", *map(render_text, tables))
+    yield replace(made.found, files=(made.ply,), notes=notes)
+
+
+def reconstruct_capture(job: Job, settings: ReconstructSettings) -> ReconstructedCapture:
+    """Reconstruct a capture, and write its file; nothing is stored."""
+    store, capture, warn = job.store, settings.capture, job.warn
+    check_accepted(store, settings.accept_rejected)
+    name = settings.model or preferred_model(store)
+    warn_if_stale(store, warn)
+    check_capture_sizes(store, [capture])
+    job.progress(0.1, "reading and decoding")
+    shot, frames, decoded = next(decode_captures(store, [capture], warn, relative=True, check=settings.check))
+    phases = absolute_phases(store, capture, decoded, settings.depth_range, warn)
+    is_pose = shot.role == "calibration"
+    texture = capture_texture(shot, frames, stretch=is_pose)
+    chosen = load_models(store, () if is_pose and settings.model is None else (name,))
+    job.progress(0.6, "reconstructing")
+    options: dict[str, Any] = {"axis": settings.axis, "texture": texture, "accept_rejected": settings.accept_rejected}
+    clouds = {n: capture_cloud(store, m, shot, phases, warn=warn, **options) for n, m in chosen.items()}
+    board, region = None, segment_board(store, shot, texture, warn) if is_pose else None
+    if region is not None:
+        depths = load_stereo(store).depth_range_mm
+        board = compare("plane", clouds, illuminated_pixels(phases, clouds), region=region, depth_range=depths)
+    cloud, restrictions = clouds[name], tuple[str, ...]()
+    if not is_pose:
+        box = resolve_region(store, settings.roi)
+        cloud, restrictions = restrict_cloud(store, capture, cloud, box), restriction_notes(store, [capture], box)
+    mask = cloud.mask if region is None else cloud.mask & region
+    if not mask.any():
+        raise InputError(
+            f"{capture}: no pixel could be reconstructed with {name}: does the calibration belong to this camera and "
+            "projector, and is the scene within its depths?"
+        )
+    job.progress(0.8, "writing")
+    path = _write_files(store, settings, cloud, mask, (f"calibration {name}", *restrictions))
+    found = cloud_record(store, settings, chosen[name], clouds[name], phases[cloud.axis], region)
+    job.progress(1.0, "reconstructed")
+    return ReconstructedCapture(found, cloud, phases, path, int(np.count_nonzero(mask)), board, restrictions)
+
+
+def _write_files(
+    store: Session, settings: ReconstructSettings, cloud: Cloud, mask: np.ndarray, notes: Sequence[str]
+) -> Path:
+    """Write a cloud's points under ``mask`` (h, w) bool as PLY, and its grid where that is wanted; returns the path."""
+    capture, points = settings.capture, cloud.points
+    assert cloud.texture is not None
+    faces = triangulate_points(points, mask) if settings.mesh else None
+    notes = (f"scan {capture}, frame: {frame_of(store, cloud.model)}", *notes)
+    name = f"{capture}_{cloud.model}{'_mesh' if settings.mesh else ''}.ply"
+    with placed_file(store, settings.out, name) as (path, written):
+        chosen = choose_pixels(points, mask)
+        write_ply(written, chosen, cloud.texture[mask], normals(points)[mask], cloud.sigmas(mask), faces, notes)
+        if settings.grid is not None:
+            write_grid(Path(settings.grid), points)
+    return path
+
+
+def cloud_record(
+    store: Session,
+    settings: ReconstructSettings,
+    model: Model,
+    cloud: Cloud,
+    phase: PhaseMap,
+    region: np.ndarray | None,
+) -> Found[Reconstruction]:
+    """Return what is stored of a capture's cloud, before edits and region; ``region`` (h, w) bool: of the board."""
     near, far = np.percentile(cloud.points[..., 2][cloud.mask], [1, 99])
-    meta = {
-        "model": cloud.model,
-        "axis": cloud.axis,
-        "points": int(np.count_nonzero(cloud.mask)),
-        "depth_mm": [float(near), float(far)],
-        "noise_mm": float(np.median(cloud.sigma_z[cloud.mask])),
-        "masked": masked,
-        "scale": describe_scale(store, cloud.model),
-        "scales": {cloud.model: scale_factor(store, cloud.model)},
-        "inputs": store.input_hashes(capture, *dict.fromkeys(("calibration/stereo", f"calibration/{cloud.model}"))),
-    }
     assert cloud.texture is not None
     arrays = {
         "points": cloud.points,
@@ -213,13 +183,28 @@ def save_cloud(store: Session, capture: str, cloud: Cloud, phase: PhaseMap, mask
         "phase": phase.phase,
         "modulation": phase.modulation,
         "texture": cloud.texture,
+        "sigma_calibration": cloud.sigma_calibration,
+        "sigma_edges": cloud.sigma_edges,
     }
-    if cloud.sigma_calibration is not None:
-        meta["sigma_calibration_mm"] = float(np.median(cloud.sigma_calibration[cloud.mask]))
-        arrays["sigma_calibration"] = cloud.sigma_calibration
-    if cloud.sigma_edges is not None:
-        arrays["sigma_edges"] = cloud.sigma_edges
-    store.save_result(f"clouds/{capture}", meta, arrays)
+    left = cloud.sigma_calibration
+    inputs = (settings.capture, *dict.fromkeys(("calibration/stereo", f"calibration/{cloud.model}")))
+    record = Reconstruction(
+        operation="reconstruct",
+        settings=plain_settings(settings),
+        model=cloud.model,
+        axis=cloud.axis,
+        points=int(np.count_nonzero(cloud.mask)),
+        depth_mm=(float(near), float(far)),
+        noise_mm=float(np.median(cloud.sigma_z[cloud.mask])),
+        sigma_calibration_mm=None if left is None else float(np.median(left[cloud.mask])),
+        raised=model.residuals_over_noise(cloud.axis) if isinstance(model, SplinedModel) else 1.0,
+        masked=masked_share(model, phase, region),
+        frame=frame_of(store, cloud.model),
+        scale=describe_scale(store, cloud.model),
+        scales={cloud.model: scale_factor(store, cloud.model)},
+        inputs=store.input_hashes(*inputs),
+    )
+    return Found(settings.capture, record, {name: array for name, array in arrays.items() if array is not None})
 
 
 def triangulate_points(points: np.ndarray, mask: np.ndarray) -> np.ndarray:

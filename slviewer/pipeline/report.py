@@ -1,7 +1,6 @@
 """A session as one self-contained HTML file."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -32,24 +31,25 @@ from slviewer.pipeline.models import (
 )
 from slviewer.pipeline.open_session import SessionLike, numbered_results, opened
 from slviewer.pipeline.poses import load_observations
-from slviewer.pipeline.scale import describe_scale, scale_factor
-from slviewer.pipeline.verifications import centre_spacings, read_verification
-from slviewer.records import from_plain
+from slviewer.pipeline.scale import describe_scale
+from slviewer.pipeline.stored_records import list_records
+from slviewer.records.kinds import RECORDS
+from slviewer.records.plain import from_plain
+from slviewer.records.verification import Verification
 from slviewer.report.data import (
     AcceptanceView,
     CalibrationFigures,
     CaptureRow,
     DriftRow,
-    ErrorMaps,
     ModelsView,
     PixelCurve,
     PixelFitView,
     PoseResiduals,
+    RecordsView,
     SessionData,
-    SpacingRow,
-    VerificationView,
 )
-from slviewer.report.page import write_page
+from slviewer.report.maps import verification_maps
+from slviewer.report.page import Figure, write_page
 from slviewer.report.session import session_headlines, session_sections, session_title
 from slviewer.session.capture import Capture
 from slviewer.session.measurements import measurement_arrays
@@ -105,16 +105,15 @@ def _collect_data(store: Session) -> SessionData:
     excluded = store.excluded()
     verdict = load_last_verdict(store)
     judged = store.load_result("calibration/stereo", only=())[0].get("verdict") if stereo is not None else None
-    views, spacings = _list_verifications(store)
+    records, outdated = _collect_records(store)
     region = load_region(store)
     return SessionData(
         name=store.folder.name,
         captures=[_describe_capture(c, stereo, excluded) for c in store.captures()],
         calibration=None if stereo is None else _load_calibration(store, stereo, observations),
         pixel_fits=fits,
-        verifications=views,
-        spacings=spacings,
-        warnings=stale,
+        records=records,
+        warnings=[*stale, *outdated],
         verdict=verdict,
         verdict_of_calibration=verdict is not None and judged is not None and from_plain(judged, Verdict) == verdict,
         models=_load_models(store),
@@ -159,24 +158,22 @@ def _list_drifts(store: Session) -> list[DriftRow]:
     return [DriftRow(each.drift, each.time, each.calibration == now) for each in load_drift_history(store)]
 
 
-def _list_verifications(store: Session) -> tuple[list[VerificationView], list[SpacingRow]]:
-    """The planes and spheres that were measured with the present calibrations, the first MOST_MAPS with error maps."""
-    labels = store.valid_decision("names") or {}
-    views: list[VerificationView] = []
-    for result in numbered_results(store, "verify"):
-        name = result.removeprefix("verify/")
-        if store.state_of(result) != "fresh":
-            continue
-        meta, arrays = store.load_result(result)
-        if any(scale_factor(store, model) != used for model, used in meta.get("scales", {}).items()):
-            continue  # measured before its scale was corrected, or after a correction that is gone
-        view = read_verification(name, meta, str(labels.get(name, name)))
-        if len(views) < MOST_MAPS:
-            maps = {model: arrays[f"error_{model}"] for model in view.rms_mm if f"error_{model}" in arrays}
-            floor = list(view.noise_floor_mm.values())[-1]
-            view = replace(view, maps=ErrorMaps(view.name, maps, view.rms_mm, floor))
-        views.append(view)
-    return views, centre_spacings(views)
+def _collect_records(store: Session) -> tuple[list[RecordsView], list[str]]:
+    """Return the records made from what the session holds now, by kind, with pictures of the first ones; and warnings
+    of the others."""
+    views, stale = [], []
+    for kind in RECORDS.values():
+        every = list_records(store, kind)
+        fresh = [each for each in every if not each.stale]
+        stale += [f"{kind.title} of {each.label} is left out: it is out of date." for each in every if each.stale]
+        figures: list[Figure] = []
+        for each in fresh[:MOST_MAPS]:
+            if isinstance(each.record, Verification):
+                arrays = store.load_result(f"{kind.kind}/{each.name}")[1]
+                figures.append(verification_maps(each.label, each.record, arrays))
+        if fresh:
+            views.append(RecordsView(kind, {each.label: each.record for each in fresh}, figures))
+    return views, stale
 
 
 def _describe_capture(capture: Capture, stereo: StereoModel | None, excluded: Mapping[str, str]) -> CaptureRow:

@@ -24,14 +24,16 @@ from slviewer.pipeline.capture import (
     set_camera,
 )
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings, part
-from slviewer.pipeline.merge import Merge, StartKind
-from slviewer.pipeline.merge import merge as merge_scans
+from slviewer.pipeline.merge import MergeSettings, StartKind
+from slviewer.pipeline.merge import merge as merge_operation
 from slviewer.pipeline.mesh import MeshResult
 from slviewer.pipeline.mesh import mesh as mesh_merge
 from slviewer.pipeline.models import ModelName, check_accepted, load_model, load_stereo_if_complete, preferred_model
 from slviewer.pipeline.open_session import opened_or_made
+from slviewer.pipeline.operation import Findings
 from slviewer.pipeline.rig_choice import RigSetup, SetUp, set_up
 from slviewer.pipeline.rig_presets import RigLike, load_rig
+from slviewer.records.merge import Merge
 from slviewer.registration.multiway import MOST_SCANS
 from slviewer.registration.refusal import Refused
 from slviewer.session.capture import Capture, TurnStep
@@ -53,7 +55,7 @@ class Turn:
     """The captures of a turn, in the order of their angles, and what was made of them, None where nothing was."""
 
     captures: tuple[Capture, ...]
-    merged: Merge | None = None
+    merged: Findings[Merge] | None = None
     meshed: MeshResult | None = None
 
     def to_json(self) -> dict[str, Any]:
@@ -159,16 +161,11 @@ def turn(
             progress(1.0, "captured")
             return Turn(captures)
         names = [capture.name for capture in captures]
-        merged = align_turn(
-            partial(
-                merge_scans, store, names, names[0], model=model, accept_rejected=accept_rejected,
-                progress=part(progress, 0.5, 0.8), warn=warn,
-            ),
-            warn,
-        )  # fmt: skip
+        settings = MergeSettings(names, names[0], model=model, accept_rejected=accept_rejected)
+        merged = merge_turn(store, settings, part(progress, 0.5, 0.8), warn)
         out = mesh if mesh is not None else store.exports / f"{todo[0].turn}_mesh.ply"
         meshed = mesh_merge(
-            store, [merged.result_name], out, plan=WATERTIGHT, model=model, accept_rejected=accept_rejected,
+            store, [f"merge/{next(iter(merged))}"], out, plan=WATERTIGHT, model=model, accept_rejected=accept_rejected,
             progress=part(progress, 0.8, 1.0), warn=warn,
         )  # fmt: skip
     return Turn(captures, merged, meshed)
@@ -272,18 +269,21 @@ def capture_turn(
         table.close()
 
 
-def align_turn(merge: Callable[..., T], warn: Warn) -> T:
-    """Return ``merge(start="turntable")`` of the scans of a turn; by features where the angles do not fit the scans.
+def merge_turn(store: Session, settings: MergeSettings, progress: Progress, warn: Warn) -> Findings[Merge]:
+    """Merge the scans of a turn by the angles of its turntable; by features where the angles do not fit the scans."""
+    return align_turn(lambda start: merge_operation.run(store, replace(settings, start=start), progress, warn), warn)
+
+
+def align_turn(merge: Callable[[StartKind], T], warn: Warn) -> T:
+    """Return ``merge("turntable")`` of the scans of a turn; by features where the angles do not fit the scans.
 
     They do not where the motor lost steps, the object slipped, or the table was moved while it was switched off.
     """
-    start: StartKind = "turntable"
     try:
-        return merge(start=start)
+        return merge("turntable")
     except (Refused, InputError) as error:
         warn(f"the angles of the turntable do not align the scans, they are aligned by features instead: {error}")
-    start = "features"
-    return merge(start=start)
+    return merge("features")
 
 
 def _origin(table: Turntable, recorded: Sequence[TurnStep], warn: Warn) -> float:

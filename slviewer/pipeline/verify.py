@@ -1,22 +1,19 @@
 """Measuring known shapes with each model, and comparing."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from itertools import combinations
-from typing import Any, Literal
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
 from slviewer.errors import InputError, UsageError
 from slviewer.evaluation.compare import Comparison, compare
-from slviewer.evaluation.plane import PlaneResult
-from slviewer.evaluation.render import render
-from slviewer.evaluation.sphere import SphereResult
+from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis
 from slviewer.pipeline.capture_clouds import capture_cloud, check_capture_sizes
 from slviewer.pipeline.capture_phases import capture_texture, decode_captures
-from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
 from slviewer.pipeline.models import (
+    Model,
     ModelName,
     check_accepted,
     load_models,
@@ -24,92 +21,27 @@ from slviewer.pipeline.models import (
     preferred_model,
     warn_if_stale,
 )
-from slviewer.pipeline.open_session import SessionLike, opened_to_save
+from slviewer.pipeline.operation import Found, Job, operation
 from slviewer.pipeline.reconstruct import (
+    ReconstructSettings,
+    cloud_record,
     illuminated_pixels,
     masked_share,
     reconstruct_models,
-    save_cloud,
     segment_board,
 )
-from slviewer.pipeline.scale import describe_scale, scale_factor
+from slviewer.pipeline.scale import scale_factor
+from slviewer.records.reconstruction import Reconstruction
+from slviewer.records.verification import Shape, Verification
+from slviewer.session.capture import Capture
 from slviewer.session.store import Session
-
-Shape = Literal["plane", "sphere"]
 
 
 @dataclass(frozen=True)
-class Verification:
-    """The comparison of the models on each capture.
-
-    ``masked``: {capture: {model: share of the shape's pixels that it masks because no target pose illuminated what they
-    look through}}, for models that do. ``scales``: {model: what correction of scale is in it, in words}.
-    """
-
-    captures: Mapping[str, Comparison]
-    masked: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
-    scales: Mapping[str, str] = field(default_factory=dict)
-
-    def centre_distances_mm(self) -> dict[tuple[str, str], dict[str, float]]:
-        """{(capture, capture): {model: mm}}: distances between the spheres' centres; empty for planes."""
-        by_pair = {}
-        for (a, one), (b, other) in combinations(self.captures.items(), 2):
-            distances = {
-                model: float(np.linalg.norm(result.sphere.centre - partner.sphere.centre))
-                for model, result in one.results.items()
-                if isinstance(result, SphereResult) and isinstance(partner := other.results[model], SphereResult)
-            }
-            if distances:
-                by_pair[a, b] = distances
-        return by_pair
-
-    def to_json(self) -> dict[str, Any]:
-        """The contract of ``verify --json``, and for spheres the distances between their centres."""
-        data: dict[str, Any] = {"captures": {name: comparison.to_json() for name, comparison in self.captures.items()}}
-        if distances := self.centre_distances_mm():
-            data["centre_distances_mm"] = {f"{a} - {b}": by_model for (a, b), by_model in distances.items()}
-        return data
-
-    def text(self) -> str:
-        """Return the result as a report for the terminal."""
-        blocks = [f"{name}:\n{comparison.text()}" for name, comparison in self.captures.items()]
-        if distances := self.centre_distances_mm():
-            table = [
-                {"centres": f"{a} - {b}"} | {f"{model} mm": mm for model, mm in by_model.items()}
-                for (a, b), by_model in distances.items()
-            ]
-            blocks.append(f"distances between the centres:\n{render(table)}")
-        for name, shares in self.masked.items():
-            blocks += [
-                f"{name}: {model} masks {100 * share:.1f} % of the shape's pixels: they lie outside the calibrated "
-                "region"
-                for model, share in shares.items()
-                if share > 0.005
-            ]
-        blocks += [f"{model}: {words}" for model, words in self.scales.items()]
-        return "\n".join(blocks)
-
-
-def verify(
-    session: SessionLike,
-    captures: Sequence[str],
-    shape: Shape,
-    *,
-    models: Sequence[ModelName] = (),
-    depth_range: tuple[float, float] | None = None,
-    radius: float | None = None,
-    axis: Axis | None = None,
-    accept_rejected: bool = False,
-    check: bool = True,
-    progress: Progress = ignore_progress,
-    warn: Warn = ignore_warnings,
-) -> Verification:
-    """Measure captures of a plane or a sphere with each model, over the pixels that all of them measure, and compare.
-
-    The session stores the figures, the error maps, and the cloud of the model that it prefers, if that is compared.
+class VerifySettings:
+    """How captures of a known shape are measured.
 
     Args:
-        session: Session folder.
         captures: Names of the captures.
         shape: What the captures show.
         models: Which calibrations to compare; by default all there are.
@@ -120,66 +52,102 @@ def verify(
 
     ``check``: also compare the frames with each other, and warn of those that do not fit.
     """
-    if not captures:
-        raise UsageError("no capture named: give the captures to measure, for instance plane_01 plane_02")
-    if depth_range is not None and not 0 < depth_range[0] < depth_range[1]:
-        raise UsageError(f"the range {depth_range[0]:g} {depth_range[1]:g} is empty: give near and far in mm")
-    if radius is not None and not radius > 0:
-        raise UsageError(f"a radius of {radius:g} mm is not possible: give a positive one")
-    results: dict[str, Comparison] = {}
-    masked: dict[str, dict[str, float]] = {}
-    with opened_to_save(session, warn) as store:
-        check_accepted(store, accept_rejected)
-        chosen = load_models(store, models)
-        warn_if_stale(store, warn)
-        reach = depth_range or load_stereo(store).depth_range_mm
-        check_capture_sizes(store, captures)
-        for i, (shot, frames, phases) in enumerate(decode_captures(store, captures, warn, check=check)):
-            progress(i / len(captures), f"measuring {shot.name}")
-            clouds = reconstruct_models(store, chosen, shot, phases, axis, accept_rejected=accept_rejected, warn=warn)
-            region: np.ndarray | None = None
-            if shape == "plane" and shot.role == "calibration":
-                region = segment_board(store, shot, capture_texture(shot, frames), warn)
-            try:
-                result = compare(
-                    shape, clouds, illuminated_pixels(phases, clouds), region=region, depth_range=reach, radius=radius
-                )
-            except InputError as error:
-                raise InputError(f"{shot.name}: {error}") from error
-            for message in result.warnings:
-                warn(f"{shot.name}: {message}")
-            results[shot.name] = result
-            axis_used = next(iter(clouds.values())).axis
-            masked[shot.name] = {
-                name: share
-                for name, model in chosen.items()
-                if (share := masked_share(model, phases[axis_used], result.region)) is not None
-            }
-            if store.is_writable:
-                _save_verification(store, shot.name, result, masked[shot.name])
-                if (best := chosen.get(preferred_model(store))) is not None:  # by its own best axis, as reconstruct
-                    texture = capture_texture(shot, frames, stretch=shot.role == "calibration")
-                    cloud = capture_cloud(
-                        store, best, shot, phases, axis=axis, texture=texture, accept_rejected=accept_rejected
-                    )
-                    phase = phases[cloud.axis]
-                    save_cloud(store, shot.name, cloud, phase, masked_share(best, phase, region))
-        scales = {name: words for name in chosen if (words := describe_scale(store, name))}
-        progress(1.0, "measured")
-    return Verification(results, masked, scales)
+
+    UNRECORDED: ClassVar = ("check",)
+    captures: Sequence[str]
+    shape: Shape
+    models: Sequence[ModelName] = ()
+    depth_range: tuple[float, float] | None = None
+    radius: float | None = None
+    axis: Axis | None = None
+    accept_rejected: bool = False
+    check: bool = True
+
+    def __post_init__(self) -> None:
+        if not self.captures:
+            raise UsageError("no capture named: give the captures to measure, for instance plane_01 plane_02")
+        if self.depth_range is not None and not 0 < self.depth_range[0] < self.depth_range[1]:
+            near, far = self.depth_range
+            raise UsageError(f"the range {near:g} {far:g} is empty: give near and far in mm")
+        if self.radius is not None and not self.radius > 0:
+            raise UsageError(f"a radius of {self.radius:g} mm is not possible: give a positive one")
 
 
-def _save_verification(store: Session, capture: str, found: Comparison, masked: Mapping[str, float]) -> None:
-    """Store how far a capture is from its shape as ``verify/<capture>``, with the error map (h, w) mm of each model."""
-    models = tuple(found.results)
-    meta = {
-        **found.to_json(),
-        "centres_mm": {m: r.sphere.centre for m, r in found.results.items() if isinstance(r, SphereResult)},
-        "masked": dict(masked),
-        "scales": {model: scale_factor(store, model) for model in models},
-        "normals": {m: r.plane.normal for m, r in found.results.items() if isinstance(r, PlaneResult)},
-        "inputs": store.input_hashes(capture, *(f"calibration/{model}" for model in models)),
-    }
-    store.save_result(
-        f"verify/{capture}", meta, {f"error_{m}": result.error_map for m, result in found.results.items()}
+@dataclass(frozen=True, eq=False)
+class ComparedCapture:
+    """A capture that models were compared on: its phases, what was found, and {model: share of the shape's pixels that
+    it masks, because no target pose illuminated what they look through} of models that do."""
+
+    capture: Capture
+    frames: np.ndarray
+    phases: Mapping[Axis, PhaseMap]
+    found: Comparison
+    masked: Mapping[str, float]
+
+
+@operation("verify", Verification, VerifySettings)
+def verify(job: Job, settings: VerifySettings) -> Iterator[Found[Verification] | Found[Reconstruction]]:
+    """Measure captures of a plane or a sphere with each model, over the pixels that all of them measure, and compare.
+
+    The session stores the figures, the error maps, and the cloud of the model that it prefers, if that is compared.
+    """
+    store = job.store
+    chosen = load_models(store, settings.models)
+    for each in compare_captures(job, settings, chosen):
+        name = each.capture.name
+        yield Found(name, _make_record(store, each), {f"error_{m}": r.error_map for m, r in each.found.results.items()})
+        if store.is_writable and (best := chosen.get(preferred_model(store))) is not None:
+            yield _reconstruct_best(store, best, each, settings)  # by its own best axis, as reconstruct
+
+
+def compare_captures(job: Job, settings: VerifySettings, chosen: Mapping[str, Model]) -> Iterator[ComparedCapture]:
+    """Yield the comparison of models on each capture."""
+    store, names = job.store, settings.captures
+    check_accepted(store, settings.accept_rejected)
+    warn_if_stale(store, job.warn)
+    check_capture_sizes(store, names)
+    depths = settings.depth_range or load_stereo(store).depth_range_mm
+    for i, (shot, frames, phases) in enumerate(decode_captures(store, names, job.warn, check=settings.check)):
+        job.progress(i / len(names), f"measuring {shot.name}")
+        clouds = reconstruct_models(
+            store, chosen, shot, phases, settings.axis, accept_rejected=settings.accept_rejected, warn=job.warn
+        )
+        region: np.ndarray | None = None
+        if settings.shape == "plane" and shot.role == "calibration":
+            region = segment_board(store, shot, capture_texture(shot, frames), job.warn)
+        lit = illuminated_pixels(phases, clouds)
+        try:
+            found = compare(settings.shape, clouds, lit, region=region, depth_range=depths, radius=settings.radius)
+        except InputError as error:
+            raise InputError(f"{shot.name}: {error}") from error
+        for message in found.warnings:
+            job.warn(f"{shot.name}: {message}")
+        phase = phases[next(iter(clouds.values())).axis]
+        shares = {model: masked_share(fitted, phase, found.region) for model, fitted in chosen.items()}
+        masked = {model: share for model, share in shares.items() if share is not None}
+        yield ComparedCapture(shot, frames, phases, found, masked)
+    job.progress(1.0, "measured")
+
+
+def _make_record(store: Session, each: ComparedCapture) -> Verification:
+    """Return the record of a comparison, with the scales and the hashes of what it was made from."""
+    models = tuple(each.found.results)
+    return each.found.record(
+        each.masked,
+        scales={model: scale_factor(store, model) for model in models},
+        inputs=store.input_hashes(each.capture.name, *(f"calibration/{model}" for model in models)),
     )
+
+
+def _reconstruct_best(
+    store: Session, model: Model, each: ComparedCapture, settings: VerifySettings
+) -> Found[Reconstruction]:
+    """Return the cloud of a capture as `reconstruct` stores it."""
+    shot, found = each.capture, each.found
+    texture = capture_texture(shot, each.frames, stretch=shot.role == "calibration")
+    cloud = capture_cloud(
+        store, model, shot, each.phases, axis=settings.axis, texture=texture, accept_rejected=settings.accept_rejected
+    )
+    region = None if found.is_searched else found.region
+    as_reconstructed = ReconstructSettings(shot.name, axis=settings.axis, accept_rejected=settings.accept_rejected)
+    return cloud_record(store, as_reconstructed, model, cloud, each.phases[cloud.axis], region)

@@ -14,6 +14,8 @@ from slviewer.calibration.diagnosis.verdict import Verdict
 from slviewer.calibration.drift.check import Drift
 from slviewer.calibration.stereo import StereoModel
 from slviewer.evaluation.crossvalidation import CrossValidation
+from slviewer.records.record import Record
+from slviewer.report.page import Figure
 from slviewer.session.measurements import Measurement
 
 ByModel = Mapping[str, float]
@@ -191,24 +193,12 @@ class PixelFitView:
 
 
 @dataclass(frozen=True, eq=False)
-class VerificationView:
-    """A plane or sphere measured by each model; ``coverage`` is a share 0 to 1, ``true_radius_mm`` NaN if unknown."""
+class RecordsView:
+    """The records of one kind by their labels, and pictures of them."""
 
-    name: str
-    shape: Literal["plane", "sphere"]
-    incidence: Mapping[str, float]
-    points: int
-    set_aside: Mapping[str, int]
-    coverage: ByModel
-    rms_mm: ByModel
-    noise_floor_mm: ByModel
-    radius_mm: ByModel = field(default_factory=dict)
-    true_radius_mm: float = float("nan")
-    maps: ErrorMaps | None = None
-    masked: ByModel = field(default_factory=dict)  # share, 0 to 1, outside the calibrated region
-    capture: str = ""
-    stale: bool = False  # measured with another calibration or scale
-    centres_mm: Mapping[str, np.ndarray] = field(default_factory=dict)  # (3,), of a sphere by model
+    kind: type[Record]
+    records: Mapping[str, Any]
+    figures: Sequence[Figure] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -255,8 +245,7 @@ class SessionData:
     captures: Sequence[CaptureRow]
     calibration: CalibrationFigures | None = None
     pixel_fits: Sequence[PixelFitView] = ()
-    verifications: Sequence[VerificationView] = ()
-    spacings: Sequence[SpacingRow] = ()
+    records: Sequence[RecordsView] = ()
     warnings: Sequence[str] = ()
     verdict: Verdict | None = None
     verdict_of_calibration: bool = True

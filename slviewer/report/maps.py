@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from slviewer.errors import InputError
+from slviewer.records.verification import Verification
 from slviewer.report.canvas import (
     FULL,
     HALF,
@@ -101,6 +102,19 @@ def error_maps(
         f"{_describe_floor(floor_mm)}.",
         f"Error maps and histograms of {title}; RMS {listed}",
     )
+
+
+SIGN = {"plane": "red is towards the camera", "sphere": "red is outwards"}
+"""What a positive error of a shape means in its maps."""
+
+
+def verification_maps(title: str, found: Verification, arrays: Mapping[str, np.ndarray], width: int = FULL) -> Figure:
+    """Error maps of a verification, with its arrays."""
+    fits = {model: fit for model, fit in found.models.items() if f"error_{model}" in arrays}
+    rms = {model: np.nan if fit.rms_mm is None else fit.rms_mm for model, fit in fits.items()}
+    floor = next((fit.noise_floor_mm for fit in reversed(fits.values()) if fit.noise_floor_mm is not None), np.nan)
+    maps = {model: arrays[f"error_{model}"] for model in fits}
+    return error_maps(title, maps, rms, floor, width=width, sign=SIGN[found.shape])
 
 
 def error_limit(maps: list[np.ndarray]) -> float:

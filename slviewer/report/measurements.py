@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 from slviewer.inspection.colours import EXCLUDED_COLOUR, colour_limit, deviation_colours
 from slviewer.inspection.quantities import Quantity
 from slviewer.inspection.tolerance import DECIDED, RULE
-from slviewer.records import from_plain
+from slviewer.records.plain import from_plain
+from slviewer.records.table import Cell, Column, Mark, Table
 from slviewer.report.canvas import (
     DENSITY,
     FULL,
@@ -23,7 +24,7 @@ from slviewer.report.canvas import (
     style_axes,
     style_image_axes,
 )
-from slviewer.report.page import Cell, Column, Figure, Item, Mark, PageNotice, Section, Table
+from slviewer.report.page import Figure, Item, PageNotice, Section
 from slviewer.report.shaded import render_points, view_rotation
 from slviewer.report.tables import UNKNOWN, format_number
 from slviewer.session.measurements import Measurement

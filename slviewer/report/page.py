@@ -21,14 +21,13 @@ from numpy.typing import NDArray
 from slviewer import __version__
 from slviewer.errors import InputError
 from slviewer.printable import escape_controls
+from slviewer.records.table import Mark, Table
 from slviewer.session.atomic import rename
 
 CERTIFICATE = '<template id="certificate">', "</template>"
 """What stands before and after a page's certificate: what it was made from, as escaped JSON; browsers neither show nor
 run it."""
 _WRITTEN = "<footer>", "</footer>"
-Mark = Literal["", "better", "worse", "strong", "muted"]
-"""How a value stands to its rivals; colour and weight follow it, and the text beside it says so in words."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,54 +58,6 @@ def _encode_image(pixels: NDArray[np.uint8], **options: Any) -> bytes:
     buffer = io.BytesIO()
     Image.fromarray(pixels).save(buffer, **options)
     return buffer.getvalue()
-
-
-@dataclass(frozen=True)
-class Cell:
-    """A table cell whose value is marked."""
-
-    text: str
-    mark: Mark = ""
-
-
-@dataclass(frozen=True)
-class Column:
-    """A column's heading, its unit, and the group of neighbours that it shares a heading with."""
-
-    title: str
-    unit: str = ""
-    group: str = ""
-    align: Literal["left", "right", "centre"] = "right"
-
-
-@dataclass(frozen=True)
-class Table:
-    """Rows of texts or cells under columns; ``footer`` rows (means) stand apart below, then ``notes``."""
-
-    columns: Sequence[Column]
-    rows: Sequence[Sequence[str | Cell]]
-    caption: str
-    notes: Sequence[str] = ()
-    footer: Sequence[Sequence[str | Cell]] = ()
-
-    def __post_init__(self) -> None:
-        for row in (*self.rows, *self.footer):
-            if len(row) != len(self.columns):
-                raise InputError(
-                    f"a row of the table '{self.caption}' has {len(row)} cells and the table {len(self.columns)} "
-                    "columns: give one cell a column"
-                )
-
-    @property
-    def groups(self) -> list[tuple[str, int]]:
-        """The headings above the columns' own, with how many columns each spans; empty where no column has one."""
-        spans: list[tuple[str, int]] = []
-        for column in self.columns:
-            if spans and spans[-1][0] == column.group:
-                spans[-1] = (column.group, spans[-1][1] + 1)
-            else:
-                spans.append((column.group, 1))
-        return spans if any(name for name, _ in spans) else []
 
 
 @dataclass(frozen=True)
@@ -216,7 +167,6 @@ def _render(title: str, subtitle: str, headlines: Sequence[Headline], sections: 
     )
     environment.tests["figure"] = lambda item: isinstance(item, Figure)
     environment.tests["table"] = lambda item: isinstance(item, Table)
-    environment.tests["cell"] = lambda item: isinstance(item, Cell)
     environment.filters["webp"] = pictures.__getitem__
     template = environment.from_string((here / "page.html.j2").read_text(encoding="utf-8"))
     return template.render(

@@ -9,8 +9,9 @@ from slviewer.evaluation.acceptance.figures import Decision
 from slviewer.evaluation.capability import Capability
 from slviewer.evaluation.render import format_count
 from slviewer.inspection.parts import CharacteristicResult, PartResult
+from slviewer.records.table import Cell, Column, Mark, Table
 from slviewer.report.canvas import HALF, INK, SOFT, finish_figure, new_figure, style_axes
-from slviewer.report.page import Cell, Column, Figure, Headline, Mark, PageNotice, Section, Table, write_page
+from slviewer.report.page import Figure, Headline, PageNotice, Section, write_page
 from slviewer.report.tables import UNKNOWN, format_number
 from slviewer.session.inspection_plan import Characteristic, Plan
 

@@ -5,8 +5,9 @@ from typing import Any
 
 from slviewer.calibration.diagnosis.verdict import Verdict
 from slviewer.evaluation.crossvalidation import CrossValidation
+from slviewer.records.table import Cell, Column, Mark, Table
 from slviewer.report.data import AcceptanceView, DriftRow, ModelsView
-from slviewer.report.page import Cell, Column, Headline, Item, Mark, PageNotice, Section, Table
+from slviewer.report.page import Headline, Item, PageNotice, Section
 from slviewer.report.tables import UNKNOWN, format_number
 
 _LEVELS: dict[str, tuple[str, str]] = {

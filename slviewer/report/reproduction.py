@@ -4,13 +4,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from slviewer.records.table import Cell, Column, Table
 from slviewer.report.bars import rms_bars
 from slviewer.report.canvas import HALF
 from slviewer.report.clouds import draw_clouds, draw_merged_cloud
 from slviewer.report.curves import pixel_curves
 from slviewer.report.data import PlaneRow, ReproductionData
 from slviewer.report.maps import error_limit, error_maps, rms_maps
-from slviewer.report.page import Cell, Column, Headline, Item, PageNotice, Section, Table
+from slviewer.report.page import Headline, Item, PageNotice, Section
 from slviewer.report.space import planes_in_space
 from slviewer.report.tables import (
     format_number,
@@ -218,7 +219,7 @@ def _pair_headline(label: str, values: dict[str, float], note: str) -> Headline:
 def _format_pair(values: dict[str, float]) -> str:
     """Text "stereo → pixelwise mm" of an error by model, mm."""
     base, ours = (format_number(values[model]) for model in (BASE, OURS))
-    return f"{base if isinstance(base, str) else base.text} → {ours if isinstance(ours, str) else ours.text} mm"
+    return f"{base if isinstance(base, str) else base.value} → {ours if isinstance(ours, str) else ours.value} mm"
 
 
 def _format_mm(value: float) -> str:

@@ -1,5 +1,6 @@
 """Report sections of a session: captures, calibration and verification."""
 
+import inspect
 from collections.abc import Mapping
 
 import numpy as np
@@ -7,11 +8,13 @@ import numpy as np
 from slviewer.calibration.stereo import StereoModel
 from slviewer.evaluation.render import format_count
 from slviewer.geometry.lens import Lens
+from slviewer.records.table import Cell, Column, Mark, Table
+from slviewer.records.verification import Verification
 from slviewer.report.canvas import percentile
-from slviewer.report.data import CalibrationFigures, SessionData, VerificationView
-from slviewer.report.maps import error_maps, rms_maps
+from slviewer.report.data import CalibrationFigures, RecordsView, SessionData
+from slviewer.report.maps import rms_maps
 from slviewer.report.measurements import deviations_section, measurements_section
-from slviewer.report.page import Cell, Column, Headline, Item, Mark, PageNotice, Section, Table
+from slviewer.report.page import Headline, Item, PageNotice, Section
 from slviewer.report.quality import (
     acceptance_section,
     drift_section,
@@ -20,21 +23,10 @@ from slviewer.report.quality import (
     verdict_section,
 )
 from slviewer.report.reprojection import coverage, pose_bars, residual_arrows
-from slviewer.report.tables import (
-    UNKNOWN,
-    better_worse,
-    compare_errors,
-    format_incidence,
-    format_number,
-    known_mean,
-    models_of,
-    spacing_table,
-)
+from slviewer.report.tables import format_number
 
 WORST = 2.0
 """A pose whose reprojection error exceeds the RMS over the poses this many times is marked."""
-MAX_EXCLUDED_PERCENT = 2.0
-"""More points set aside than this, and the RMS does not speak for the shape."""
 
 
 def session_title(data: SessionData) -> tuple[str, str]:
@@ -77,17 +69,24 @@ def session_headlines(data: SessionData) -> list[Headline]:
 
 def _plane_headline(data: SessionData) -> list[Headline]:
     """Headline of the flattest model's mean plane RMS, beside its noise floor and the other models'."""
-    planes = [v for v in data.verifications if v.shape == "plane"]
-    means = {m: known_mean([v.rms_mm.get(m, np.nan) for v in planes]) for m in models_of([v.rms_mm for v in planes])}
-    means = {m: mean for m, mean in means.items() if np.isfinite(mean)}
+    fits = [
+        (model, fit)
+        for view in data.records
+        if view.kind is Verification
+        for each in view.records.values()
+        if each.shape == "plane"
+        for model, fit in each.models.items()
+    ]
+    rms = {model: [fit.rms_mm for name, fit in fits if name == model and fit.rms_mm is not None] for model, _ in fits}
+    means = {model: float(np.mean(values)) for model, values in rms.items() if values}
     if not means:
         return []
-    model = min(means, key=lambda m: means[m])
-    floor = known_mean([v.noise_floor_mm.get(model, np.nan) for v in planes])
-    notes = [f"noise floor {floor:.3f} mm"] if np.isfinite(floor) else []
-    notes += [f"{other} {mean:.3f} mm" for other, mean in means.items() if other != model]
+    best = min(means, key=lambda model: means[model])
+    floors = [fit.noise_floor_mm for name, fit in fits if name == best and fit.noise_floor_mm is not None]
+    notes = [f"noise floor {np.mean(floors):.3f} mm"] if floors else []
+    notes += [f"{other} {mean:.3f} mm" for other, mean in means.items() if other != best]
     mark: Mark = "better" if len(means) > 1 else ""
-    return [Headline(f"{means[model]:.3f} mm", f"mean plane RMS, {model}", "; ".join(notes), mark)]
+    return [Headline(f"{means[best]:.3f} mm", f"mean plane RMS, {best}", "; ".join(notes), mark)]
 
 
 def session_sections(data: SessionData) -> list[Section]:
@@ -101,8 +100,7 @@ def session_sections(data: SessionData) -> list[Section]:
         sections.append(models_section(data.models))
     if data.pixel_fits:
         sections.append(_pixel_fits_section(data))
-    if data.verifications or data.spacings:
-        sections.append(_verifications_section(data))
+    sections += [_records_section(view) for view in data.records]
     if data.acceptances:
         sections.append(acceptance_section(data.acceptances))
     if data.drifts:
@@ -288,78 +286,7 @@ def _pixel_fits_section(data: SessionData) -> Section:
     )
 
 
-def _verifications_section(data: SessionData) -> Section:
-    """The section about measured planes and spheres: tables, distances and error maps."""
-    items: list[Item] = []
-    for shape, caption in (
-        ("plane", "Planes: RMS distance from the best plane"),
-        ("sphere", "Spheres: RMS and radius"),
-    ):
-        verifications = [v for v in data.verifications if v.shape == shape]
-        if verifications:
-            items.append(_verification_table(verifications, caption))
-    if data.spacings:
-        items.append(spacing_table(data.spacings, "Distances between the centres of spheres"))
-    for v in data.verifications:
-        if v.maps is not None:
-            sign = "red is outwards" if v.shape == "sphere" else "red is towards the camera"
-            items.append(error_maps(v.maps.title, v.maps.maps, v.maps.rms_mm, v.maps.noise_floor_mm, sign=sign))
-    return Section(
-        "Verification",
-        "Known shapes, measured by each model. Every RMS stands beside its noise floor: what the capture's noise alone "
-        "would give.",
-        items,
-    )
-
-
-def _verification_table(verifications: list[VerificationView], caption: str) -> Table:
-    """Table of measured planes or spheres by model: RMS, noise floor and comparison with the first model."""
-    models = models_of([v.rms_mm for v in verifications])
-    sphere = verifications[0].shape == "sphere"
-    columns = [
-        Column("capture", align="left"),
-        Column("model", align="left"),
-        Column("RMS", "mm"),
-        Column("floor", "mm"),
-    ]
-    columns += [Column("against " + models[0], align="left")] if len(models) > 1 else []
-    columns += [Column("radius", "mm"), Column("error", "mm")] if sphere else []
-    columns += [
-        Column("R1 / R2 / R3", "%", align="centre"),
-        Column("points"),
-        Column("excluded", "%"),
-        Column("coverage", "%"),
-    ]
-    masked = any(v.masked for v in verifications)
-    columns += [Column("masked", "%")] if masked else []
-    rows: list[list[str | Cell]] = []
-    for v in verifications:
-        for i, model in enumerate(m for m in models if m in v.rms_mm):
-            rms, rival = v.rms_mm[model], v.rms_mm.get(models[0], np.nan)
-            mark = better_worse(rms, rival) if model != models[0] else ""
-            text = format_number(rms)
-            row: list[str | Cell] = [v.name if not i else "", model]
-            row += [
-                Cell(text, mark) if isinstance(text, str) else text,
-                format_number(v.noise_floor_mm.get(model, np.nan)),
-            ]
-            if len(models) > 1:
-                row.append(compare_errors(rms, rival) if model != models[0] else "")
-            if sphere:
-                radius = v.radius_mm.get(model, np.nan)
-                row += [format_number(radius), format_number(radius - v.true_radius_mm, signed=True)]
-            excluded = 100 * v.set_aside.get(model, 0) / max(v.points, 1)
-            share = f"{excluded:.1f}"
-            row += [format_incidence(v.incidence) if not i else "", f"{v.points:,}" if not i else ""]
-            row.append(Cell(share, "worse") if excluded > MAX_EXCLUDED_PERCENT else share)
-            row.append(format_number(100 * v.coverage[model], 1) if model in v.coverage else UNKNOWN)
-            if masked:
-                row.append(format_number(100 * v.masked[model], 1) if model in v.masked else UNKNOWN)
-            rows.append(row)
-    notes = [
-        "Excluded: points beyond 5 robust sigma; above 2 % the RMS does not describe the shape. Coverage: measured "
-        "pixels of those illuminated and modulated."
-    ]
-    if masked:
-        notes.append("Masked: pixels outside the calibrated region.")
-    return Table(columns, rows, caption, notes)
+def _records_section(view: RecordsView) -> Section:
+    """The section with the tables and pictures of the records of one kind."""
+    text = inspect.cleandoc(view.kind.__doc__ or "").split("\n\n")[0].replace("\n", " ")
+    return Section(view.kind.title, text, [*view.kind.tables(view.records), *view.figures])

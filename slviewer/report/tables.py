@@ -5,11 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from slviewer.records.table import Cell, Column, Table, better_worse, compare_errors
 from slviewer.report.data import ByModel, MergePair, PlaneRow, SpacingRow, SphereRow
-from slviewer.report.page import Cell, Column, Mark, Table
 
-EQUAL = 0.02
-"""Two errors that differ by less than this share are called equal."""
 UNKNOWN = Cell("–", "muted")
 
 
@@ -18,25 +16,6 @@ def format_number(value: float, digits: int = 3, signed: bool = False) -> str | 
     if not np.isfinite(value):
         return UNKNOWN
     return f"{value * (1 + 1e-9):{'+' if signed else ''}.{digits}f}".replace("-", "−")
-
-
-def better_worse(error: float, rival: float) -> Mark:
-    """The mark "better" or "worse" of an error against a rival's, by magnitude."""
-    error, rival = abs(error), abs(rival)
-    if not (np.isfinite(error) and np.isfinite(rival)) or abs(error - rival) <= EQUAL * max(error, rival):
-        return ""
-    return "better" if error < rival else "worse"
-
-
-def compare_errors(error: float, rival: float) -> str | Cell:
-    """The cell that compares an error with a rival's, such as ``2.6 times better``, coloured."""
-    error, rival = abs(error), abs(rival)
-    if not (np.isfinite(error) and np.isfinite(rival) and error > 0 and rival > 0):
-        return UNKNOWN
-    mark = better_worse(error, rival)
-    if not mark:
-        return "equal"
-    return Cell(f"{max(rival / error, error / rival):.2f} × {mark}", mark)
 
 
 def known_mean(values: Sequence[float]) -> float:
@@ -207,4 +186,4 @@ def _format_muted_cells(values: Sequence[float], rows: int) -> list[str | Cell]:
 
 def _remove_mark(cell: str | Cell) -> str | Cell:
     """Return the cell without its mark, unless it is muted."""
-    return cell if isinstance(cell, str) or cell.mark == "muted" else Cell(cell.text)
+    return cell if isinstance(cell, str) or cell.mark == "muted" else Cell(cell.value)

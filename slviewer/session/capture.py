@@ -15,7 +15,7 @@ import numpy as np
 from slviewer.errors import DamagedError, InputError, SessionError
 from slviewer.fringe.hdr import choose_exposure, chosen, merge_exposures, peaks, pick
 from slviewer.fringe.sequence import PatternSequence
-from slviewer.records import from_plain
+from slviewer.records.plain import from_plain
 from slviewer.session.atomic import to_json, write_bytes, write_json
 from slviewer.session.names import is_safe_name
 from slviewer.session.reading import decoding, read_json

@@ -11,7 +11,7 @@ from slviewer.inspection.features import Feature
 from slviewer.inspection.quantities import Unit
 from slviewer.inspection.regions import Region
 from slviewer.inspection.relations import MEANINGS
-from slviewer.records import from_plain, to_plain
+from slviewer.records.plain import from_plain, to_plain
 from slviewer.session.atomic import replace_file
 from slviewer.session.reading import read_toml
 from slviewer.session.toml import table_lines

@@ -10,7 +10,7 @@ import numpy as np
 
 from slviewer.errors import InputError
 from slviewer.inspection.quantities import Quantity
-from slviewer.records import from_plain
+from slviewer.records.plain import from_plain
 from slviewer.session.names import clean_label, natural_key
 from slviewer.session.store import Session
 

@@ -12,8 +12,8 @@ from typing import Annotated, Any, Literal, NotRequired, Required, TypedDict
 import msgspec
 
 from slviewer.errors import DamagedError
-from slviewer.fringe.sequence import Axis
-from slviewer.records import from_plain
+from slviewer.records.kinds import RECORDS
+from slviewer.records.plain import from_plain
 
 Extent = Annotated[int, msgspec.Meta(ge=1, le=1 << 16)]
 Size = tuple[Extent, Extent]
@@ -120,18 +120,6 @@ class _FrameCheck(ResultMeta, total=False):
     contradictions: list[dict[str, Any]]
 
 
-class _Cloud(ResultMeta, total=False):
-    """`clouds/*`."""
-
-    model: str
-    axis: Axis
-    points: int
-    depth_mm: tuple[float, float] | None
-    noise_mm: float | None
-    masked: float | None
-    scale: str
-
-
 class _Edit(TypedDict):
     """An edit of a scan: its pixels are the array of its number, or it has a plane."""
 
@@ -152,83 +140,6 @@ class _Edits(ResultMeta, total=False):
     applied: _Count
     edits: list[_Edit]
     content: str
-
-
-class _VerifiedModel(TypedDict, total=False):
-    """The figures of one model in a verification."""
-
-    points: Required[_Count]
-    set_aside: Required[_Count]
-    coverage: Required[float | None]
-    rms_mm: Required[float | None]
-    noise_floor_mm: Required[float | None]
-    radius_mm: Required[float | None]
-
-
-class _Verified(ResultMeta, total=False):
-    """`verify/*`."""
-
-    shape: str
-    incidence: dict[str, Any] | None
-    models: Annotated[dict[str, _VerifiedModel], msgspec.Meta(min_length=1)]
-    centres_mm: dict[str, _Triple]
-    masked: dict[str, Any]
-
-
-class _Pair(TypedDict, total=False):
-    """The registration of two scans."""
-
-    rms_mm: Required[float]
-    overlap: Required[float]
-    T_reference_scan: Required[_Matrix4]
-    middle: _Triple
-    sigma_shift_mm: float | None
-    sigma_turn_deg: float | None
-    point_to_point_rms_mm: float | None
-
-
-class _RegisteredPair(_Pair, total=False):
-    """The registration of two scans that are named."""
-
-    scan: Required[str]
-    onto: Required[str]
-
-
-class _Loop(TypedDict):
-    """A loop of registered pairs."""
-
-    scans: list[str]
-    error_mm: float
-    error_deg: float
-    left_mm: float
-    left_deg: float
-
-
-class _Refused(TypedDict):
-    """Two scans that were not registered, or whose registration was dropped."""
-
-    scan: str
-    onto: str
-    why: str
-
-
-class _Merge(ResultMeta, total=False):
-    """`merge/*`."""
-
-    reference: str
-    scans: list[str]
-    pairs: dict[str, _Pair]
-    points: _Count
-    ply: str
-    model: str
-    scale: str
-    registered: list[_RegisteredPair]
-    loops: list[_Loop]
-    dropped: list[_Refused]
-    refused: list[_Refused]
-    left_out: dict[str, dict[str, _Count]]
-    shared: float | None
-    restrictions: list[str]
 
 
 class _Placement(ResultMeta, total=False):
@@ -313,10 +224,7 @@ _TYPES: dict[str, Any] = {
     "poses": _Pose,
     "evidence": _Evidence,
     "trust": _FrameCheck,
-    "clouds": _Cloud,
     "edits": _Edits,
-    "verify": _Verified,
-    "merge": _Merge,
     "placement": _Placement,
     "measurements": _Measurement,
     "inspection": _Inspection,
@@ -329,3 +237,5 @@ _TYPES: dict[str, Any] = {
 def check_meta(name: str, meta: Mapping[str, Any]) -> None:
     """Raise InputError, which names the entry, unless ``meta`` is what a result of this name holds."""
     from_plain(meta, _TYPES.get(name) or _TYPES.get(name.partition("/")[0]) or ResultMeta)
+    if (kind := RECORDS.get(name.partition("/")[0])) is not None:
+        from_plain(kind.upgrade(meta), kind)

@@ -21,7 +21,7 @@ import msgspec
 import numpy as np
 
 from slviewer.errors import DamagedError, InputError, SessionError
-from slviewer.records import from_plain
+from slviewer.records.plain import from_plain
 from slviewer.session.atomic import write_bytes
 from slviewer.session.reading import decoding, read_json
 

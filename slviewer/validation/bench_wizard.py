@@ -17,6 +17,7 @@ from typing import Any
 
 from slviewer.pipeline.feedback import Progress, ignore_progress
 from slviewer.pipeline.reconstruct import reconstruct
+from slviewer.records.verification import Verification
 from slviewer.validation.bench_rows import median, row
 from slviewer.wizard.autopilot import RIG, Autopilot
 from slviewer.wizard.operator import Operator
@@ -73,7 +74,7 @@ class _Stopwatch:
             self._pose = None
         clouds = [sum(scan.cloud == "fresh" for scan in each.session.scans) for each in (before, snapshot)]  # type: ignore[union-attr]
         if self._last_frame is not None:
-            if len(snapshot.session.verifications) > len(before.session.verifications):
+            if len(snapshot.session.list_records(Verification)) > len(before.session.list_records(Verification)):
                 self.seconds["verify a plane or a sphere with all models"].append(now - self._last_frame)
             elif clouds[1] > clouds[0] and any(scan.purpose == "scan" for scan in snapshot.session.scans):
                 self.seconds["last frame of a scan to its cloud"].append(now - self._last_frame)

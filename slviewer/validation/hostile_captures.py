@@ -18,9 +18,11 @@ from slviewer.fringe.sequence import Frame, PatternSequence
 from slviewer.pipeline.calibrate import calibrate
 from slviewer.pipeline.calibration_verdict import load_last_verdict
 from slviewer.pipeline.import_captures import import_frames
-from slviewer.pipeline.reconstruct import reconstruct
-from slviewer.pipeline.verify import verify
+from slviewer.pipeline.operation import Job
+from slviewer.pipeline.reconstruct import ReconstructSettings, reconstruct_capture
+from slviewer.pipeline.verify import VerifySettings, verify
 from slviewer.reconstruction.cloud import Cloud
+from slviewer.records.verification import Shape
 from slviewer.session.store import Session
 from slviewer.session.toml import describe_sequence
 from slviewer.simulation.boards import printed_board
@@ -147,15 +149,16 @@ class HostileBench:
 
     def measure(self, session: Path, name: str, truth: tuple[Renderer, Renderer], report: CaseReport) -> MeasuredScan:
         """Reconstruct a stored scan and fit its shape; compare with the ``truth`` that the renderers know."""
-        shape = "plane" if name.startswith("plane") else "sphere"
-        done = reconstruct(
-            session, name, model=self.models[-1], out=self.folder / "cloud.ply", warn=report.warnings.append
-        )  # type: ignore[arg-type]
-        try:
-            radius = SPHERE_RADIUS_MM if shape == "sphere" else None
-            verify(session, [name], shape, models=self.models, radius=radius, warn=report.warnings.append)  # type: ignore[arg-type]
-        except SlviewerError as error:
-            report.warnings.append(str(error))
+        shape: Shape = "plane" if name.startswith("plane") else "sphere"
+        with Session.open(session) as store:
+            job, out = Job(store, warn=report.warnings.append), self.folder / "cloud.ply"
+            done = reconstruct_capture(job, ReconstructSettings(name, self.models[-1], out=out))  # type: ignore[arg-type]
+            try:
+                radius = SPHERE_RADIUS_MM if shape == "sphere" else None
+                settings = VerifySettings([name], shape, self.models, radius=radius)  # type: ignore[arg-type]
+                verify.run(store, settings, warn=job.warn)
+            except SlviewerError as error:
+                report.warnings.append(str(error))
         return compare_with_truth(done.cloud, *truth)
 
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from slviewer.evaluation.render import Row, render
-from slviewer.records import to_plain
+from slviewer.records.plain import to_plain
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 import json
 import shutil
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,12 +11,16 @@ import numpy as np
 
 from slviewer.errors import InputError, UsageError
 from slviewer.evaluation import letter
+from slviewer.evaluation.compare import Comparison
 from slviewer.pipeline.calibrate import calibrate
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings, part
-from slviewer.pipeline.merge import merge
+from slviewer.pipeline.merge import MergeSettings, merge_scans
+from slviewer.pipeline.models import load_models
+from slviewer.pipeline.operation import Job
 from slviewer.pipeline.poses import load_observations
 from slviewer.pipeline.simulate import TARGET, TRUTH, simulate
-from slviewer.pipeline.verify import Verification, verify
+from slviewer.pipeline.verify import VerifySettings, compare_captures
+from slviewer.records.verification import centre_distances_mm
 from slviewer.session.layout import is_session
 from slviewer.session.store import Session
 from slviewer.validation.reproduction import MODELS, Reproduction, write_reproduction
@@ -57,35 +62,20 @@ def reproduce(
     with Session.open(session) as store:
         names = store.capture_names("scan")
         observations = load_observations(store, list(calibration.stereo.poses))
-    planes = verify(
-        session,
-        [n for n in names if n.startswith("plane_")],
-        "plane",
-        models=MODELS,
-        depth_range=letter.DEPTH_RANGE_MM,
-        progress=part(progress, 0.65, 0.75),
-        warn=warn,
-    ).captures
-    spheres = verify(
-        session,
-        [n for n in names if n.startswith("sphere_")],
-        "sphere",
-        models=MODELS,
-        depth_range=letter.DEPTH_RANGE_MM,
-        radius=letter.SPHERE_RADIUS_MM,
-        progress=part(progress, 0.75, 0.82),
-        warn=warn,
-    )
-    merged = merge(
-        session, OBJECTS, OBJECTS[-1], out / "merged.ply", model="pixelwise", progress=part(progress, 0.82, 0.9)
-    )
+    planes, spheres = [n for n in names if n.startswith("plane_")], [n for n in names if n.startswith("sphere_")]
+    flat = _compare_models(session, VerifySettings(planes, "plane"), part(progress, 0.65, 0.75), warn)
+    round_ = VerifySettings(spheres, "sphere", radius=letter.SPHERE_RADIUS_MM)
+    balls = _compare_models(session, round_, part(progress, 0.75, 0.82), warn)
+    with Session.open(session) as store:
+        settings = MergeSettings(OBJECTS, OBJECTS[-1], out / "merged.ply", "pixelwise")
+        merged = merge_scans(Job(store, part(progress, 0.82, 0.9)), settings)
     result = Reproduction(
         quick=quick,
         stereo=calibration.stereo,
         pixelwise=calibration.pixelwise,
-        planes=planes,
-        spheres=spheres.captures,
-        spacings_mm=_compare_spacings(session, spheres),
+        planes=flat,
+        spheres=balls,
+        spacings_mm=_compare_spacings(session, balls),
         merged=merged,
         report=out / "report.html",
     )
@@ -94,6 +84,14 @@ def reproduce(
     write_reproduction(result, observations, pixel, seed)
     progress(1.0, "reproduced")
     return result
+
+
+def _compare_models(session: Path, settings: VerifySettings, progress: Progress, warn: Warn) -> dict[str, Comparison]:
+    """Return the comparison of the models on each capture, in the Letter's depth ranges."""
+    settings = replace(settings, models=MODELS, depth_range=letter.DEPTH_RANGE_MM)
+    with Session.open(session) as store:
+        compared = compare_captures(Job(store, progress, warn), settings, load_models(store, MODELS))
+        return {each.capture.name: each.found for each in compared}
 
 
 def _simulate(session: Path, scale: float, seed: int, progress: Progress) -> None:
@@ -116,10 +114,10 @@ def _load_truth(session: Path) -> dict[str, Any]:
     return truth
 
 
-def _compare_spacings(session: Path, spheres: Verification) -> dict[str, tuple[float, Mapping[str, float]]]:
+def _compare_spacings(session: Path, spheres: Mapping[str, Comparison]) -> dict[str, tuple[float, Mapping[str, float]]]:
     """{pair: (true distance, distance by model)} of the sphere centres, mm: scored against the simulation's truth."""
     centres = {name: np.array(record["centres"][0]) for name, record in _load_truth(session)["spheres"].items()}
     return {
         f"{a} - {b}": (float(np.linalg.norm(centres[a] - centres[b])), measured)
-        for (a, b), measured in spheres.centre_distances_mm().items()
+        for (a, b), measured in centre_distances_mm({name: found.record() for name, found in spheres.items()}).items()
     }

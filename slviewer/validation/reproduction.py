@@ -16,8 +16,9 @@ from slviewer.evaluation.plane import PlaneResult
 from slviewer.evaluation.render import render
 from slviewer.evaluation.sphere import SphereResult
 from slviewer.evaluation.tables import letter_rows
-from slviewer.pipeline.merge import Merge
+from slviewer.pipeline.merge import MergedScans
 from slviewer.pipeline.report import curve_at
+from slviewer.records.plain import to_plain
 from slviewer.report.data import (
     CloudView,
     ErrorMaps,
@@ -43,7 +44,7 @@ class Reproduction:
     planes: Mapping[str, Comparison]
     spheres: Mapping[str, Comparison]
     spacings_mm: Mapping[str, tuple[float, Mapping[str, float]]]
-    merged: Merge
+    merged: MergedScans
     report: Path
 
     @property
@@ -67,11 +68,11 @@ class Reproduction:
             "quick": self.quick,
             "reprojection_rms_px": dict(self.stereo.reprojection_rms_px),
             "fit_rms_mm": self.pixelwise.median_rms_mm(self.pixelwise.depth_axis),
-            "planes": {name: c.to_json() for name, c in self.planes.items()},
-            "spheres": {name: c.to_json() for name, c in self.spheres.items()},
+            "planes": {name: to_plain(c.record()) for name, c in self.planes.items()},
+            "spheres": {name: to_plain(c.record()) for name, c in self.spheres.items()},
             "in_range_ratio": self.in_range_ratio,
             "spacing_rms_mm": self.spacing_rms_mm,
-            "merge": self.merged.to_json(),
+            "merge": to_plain(self.merged.record),
             "report": str(self.report),
         }
 
@@ -81,9 +82,10 @@ class Reproduction:
         icp = letter.EXPERIMENT_3_ICP_RMS_MM
         spacing = self.spacing_rms_mm
         pairs = [
-            f"  {name}: RMS {pair.inlier_rmse_mm:.3f} mm point to point (the Letter: {icp[name[-2:].upper()]:.2f}), "
+            f"  {name}: RMS {pair.point_to_point_rms_mm:.3f} mm point to point "
+            f"(the Letter: {icp[name[-2:].upper()]:.2f}), "
             f"{pair.rms_mm:.3f} mm point to plane, overlap {100 * pair.overlap:.0f} %"
-            for name, pair in self.merged.pairs.items()
+            for name, pair in self.merged.record.pairs.items()
         ]
         size = "x".join(map(str, self.stereo.rig.camera.size))
         return "\n".join(
@@ -102,7 +104,7 @@ class Reproduction:
                 + ", ".join(f"{m} {spacing[m]:.3f} mm" for m in MODELS)
                 + ".",
                 "",
-                f"Object at three depths (experiment 3), reference {self.merged.reference}",
+                f"Object at three depths (experiment 3), reference {self.merged.record.reference}",
                 *pairs,
                 "",
                 f"Report: {self.report}",
@@ -164,12 +166,12 @@ def _make_report_data(
         pairs=[
             MergePair(
                 name,
-                merged.reference,
-                pair.inlier_rmse_mm,
+                merged.record.reference,
+                pair.point_to_point_rms_mm or float("nan"),
                 pair.overlap,
                 letter.EXPERIMENT_3_ICP_RMS_MM.get(name[-2:].upper(), float("nan")),
             )
-            for name, pair in merged.pairs.items()
+            for name, pair in merged.record.pairs.items()
         ],
         pixel_curve=curve_at(pixel, pixelwise, stereo, observations, pixelwise.depth_axis),
         rms_maps_mm=fit.rms_mm,

@@ -1,19 +1,14 @@
 """Requests to merge scans, and to undo a merge."""
 
 from collections.abc import Callable, Sequence
-from functools import partial
-from typing import TypeVar
 
-from slviewer.errors import InputError
-from slviewer.pipeline.merge import Picked, StartKind
+from slviewer.errors import InputError, SlviewerError
+from slviewer.pipeline.merge import MergeSettings, Picked, StartKind, merge
 from slviewer.registration.refusal import Refused
-from slviewer.wizard import tasks
-from slviewer.wizard.jobs import Reporter
 from slviewer.wizard.notices import describe_error
 from slviewer.wizard.requests import RequestHandler, request
 
 MERGING = "Merging"
-T = TypeVar("T")
 _ALTERNATIVES = {
     "features": "Or use the initial alignment by picked points.",
     "markers": "Or use the initial alignment by features, or by picked points.",
@@ -44,21 +39,19 @@ class MergeRequests(RequestHandler):
         """
         store = self._engine.store
         chosen = [store.load_capture(name).name for name in names]
-        merge = partial(
-            tasks.merge_scans,
-            store,
-            chosen,
-            reference,
-            start=start,
-            angle=angle,
-            picked=picked,
-            warn=self._warner("merge"),
-        )
+        failed = self._begin_merge("picked" if picked else start)
+        try:
+            settings = MergeSettings(chosen, reference, start=start, angle=angle, picked=picked)
+        except SlviewerError as error:
+            failed(error)
+            return
+        self._run(MERGING, merge, settings, "merge", failed)
 
-        self._submit_merge(merge, partial(tasks.describe_merge, reference), "picked" if picked else start)
+    def _begin_merge(self, start: str) -> Callable[[BaseException], None]:
+        """Forget why the last merge failed; returns what notes why this one did.
 
-    def _submit_merge(self, merge: Callable[[Reporter], T], describe: Callable[[T], str], start: str) -> None:
-        """Queue a merge; `start` is its initial alignment, a key of the alternatives to it."""
+        `start` is its initial alignment, a key of the alternatives to it.
+        """
         engine = self._engine
         engine.set_merge_failure("")
 
@@ -71,7 +64,7 @@ class MergeRequests(RequestHandler):
             engine.set_merge_failure(text, reason)
             engine.notices.add("error", text, f"merge-{reason}" if reason else "merge")
 
-        self._submit(MERGING, merge, describe, failed)
+        return failed
 
     @request("Undoing the merge")
     def undo_merge(self) -> None:

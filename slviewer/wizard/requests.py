@@ -1,9 +1,12 @@
 """How requests are granted or refused: at once, without raising."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import wraps
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
+from slviewer.pipeline.models import accepts_rejected
+from slviewer.pipeline.operation import Findings, Operation
 from slviewer.wizard.engine import Engine
 from slviewer.wizard.jobs import Reporter
 
@@ -34,6 +37,29 @@ class RequestHandler:
             self._engine.publisher.mark_changed(session=True)
 
         self._engine.jobs.submit(name, work, done, failed=failed)
+
+    def _run(
+        self,
+        title: str,
+        operation: Operation[..., Any, Any],
+        settings: Any,
+        section: str = "",
+        failed: Callable[[BaseException], None] | None = None,
+    ) -> None:
+        """Queue an operation on the session; the summary of what it found becomes a notice.
+
+        A calibration that the operator uses although it was rejected is used. ``section``: of the help, of warnings.
+        """
+        store, warn = self._engine.store, self._warner(section)
+
+        def work(report: Reporter) -> Findings[Any]:
+            """Run the operation, which no longer saves once the job was cancelled."""
+            used = settings
+            if accepts_rejected(store) and hasattr(settings, "accept_rejected"):
+                used = replace(settings, accept_rejected=True)
+            return operation.run(store.guarded(report.saving), used, report, warn)
+
+        self._submit(title, work, Findings.summary, failed)
 
 
 P = ParamSpec("P")

@@ -2,14 +2,24 @@
 
 from collections.abc import Sequence
 from functools import partial
+from typing import Any
 
 from slviewer.errors import InputError
 from slviewer.pipeline.align import FOLDER as PLACEMENTS
 from slviewer.pipeline.align import Placement, remove_placement
 from slviewer.pipeline.calibrate import CalibrationResult
 from slviewer.pipeline.export import What, check_export, formats
-from slviewer.pipeline.models import accept_rejected_calibration, accepts_rejected, available_models, check_accepted
-from slviewer.pipeline.verify import Shape
+from slviewer.pipeline.models import (
+    ModelName,
+    accept_rejected_calibration,
+    accepts_rejected,
+    available_models,
+    check_accepted,
+)
+from slviewer.pipeline.operations import OPERATIONS
+from slviewer.pipeline.reconstruct import ReconstructSettings, reconstruct
+from slviewer.pipeline.verify import VerifySettings, verify
+from slviewer.records.verification import Shape
 from slviewer.session.names import clean_label
 from slviewer.surface.meshing import MeshingPlan
 from slviewer.wizard import diagnostics, tasks
@@ -98,16 +108,21 @@ class ResultRequests(RequestHandler):
         """Compare the models on captures of a plane or a sphere; `radius_mm` helps to detect a sphere."""
         store = self._engine.store
         chosen = [store.load_capture(name).name for name in names]
-        verify = partial(tasks.verify_captures, store, chosen, shape, radius_mm, warn=self._warner("scans"))
-        self._submit("Verifying", verify, tasks.describe_verifications)
+        self._run("Verifying", verify, VerifySettings(chosen, shape, radius=radius_mm, check=False), "scans")
 
     @request("Reconstructing")
-    def reconstruct(self, name: str, model: str | None = None) -> None:
+    def reconstruct(self, name: str, model: ModelName | None = None) -> None:
         """Reconstruct a capture, with the best model unless one is named."""
-        store = self._engine.store
-        store.load_capture(name)
-        reconstruct = partial(tasks.reconstruct_capture, store, name, model, warn=self._warner("scans"))
-        self._submit("Reconstructing", reconstruct, lambda points: f"{name}: {points:,} points")
+        self._engine.store.load_capture(name)
+        self._run("Reconstructing", reconstruct, ReconstructSettings(name, model, check=False), "scans")
+
+    @request("Running the operation")
+    def run(self, operation: str, **settings: Any) -> None:
+        """Run any operation by the name of its command, with its settings."""
+        if operation not in OPERATIONS:
+            raise InputError(f"there is no operation {operation!r}: choose one of {', '.join(OPERATIONS)}")
+        chosen = OPERATIONS[operation]
+        self._run(operation.capitalize(), chosen, chosen.settings(**settings))
 
     @request("Aligning")
     def align(self, *names: str) -> None:

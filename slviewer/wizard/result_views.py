@@ -1,9 +1,7 @@
 """What panels draw from a session beyond the snapshot: clouds, error maps, curves. Nothing here changes the session."""
 
-from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
 
 import cv2
 import numpy as np
@@ -23,7 +21,6 @@ from slviewer.session.capture import Capture
 from slviewer.session.ply import Ply, read_ply
 from slviewer.session.scan_edits import load_region
 from slviewer.session.store import Session
-from slviewer.wizard.snapshot import MergedLoop, MergedPair, MergeView
 
 THUMBNAIL_PX = 240
 
@@ -109,55 +106,6 @@ def aligned_scans(session: Session) -> AlignedScans:
 def merged_cloud(session: Session, name: str) -> Ply:
     """Load the merged points of a merge."""
     return read_ply(session.exports / str(session.load_result(f"merge/{name}", only=())[0]["ply"]))
-
-
-def merge_view(name: str, meta: Mapping[str, Any], stale: bool) -> MergeView:
-    """Convert the `meta` of a saved merge to its view; files of older versions lack some fields."""
-    pairs = meta["pairs"]
-    onto = [{"scan": scan, "onto": meta["reference"], **pair} for scan, pair in pairs.items()]
-    stray: Counter[str] = Counter()
-    for counts in meta.get("left_out", {}).values():
-        stray.update(counts)
-    return MergeView(
-        name=name,
-        reference=meta["reference"],
-        scans=tuple(meta["scans"]),
-        points=meta["points"],
-        pairs={
-            scan: (pair["rms_mm"], pair["overlap"], np.array(pair["T_reference_scan"])) for scan, pair in pairs.items()
-        },
-        stale=stale,
-        registered=tuple(_read_merged_pair(pair) for pair in meta.get("registered", onto)),
-        loops=tuple(
-            MergedLoop(tuple(loop["scans"]), *(loop[key] for key in ("error_mm", "error_deg", "left_mm", "left_deg")))
-            for loop in meta.get("loops", ())
-        ),
-        dropped=tuple(pair["why"] for pair in meta.get("dropped", ())),
-        refused=tuple(f"{pair['scan']} → {pair['onto']}: {pair['why']}" for pair in meta.get("refused", ())),
-        stray=stray,
-        shared=meta.get("shared"),
-        markers=tuple((m["scan"], m["onto"], len(m["ids"]), m["rms_mm"]) for m in meta.get("markers", ())),
-    )
-
-
-def _read_merged_pair(pair: Mapping[str, Any]) -> MergedPair:
-    """Convert a saved pair alignment to its view, with the overlap centre's shift in mm and the rotation in degrees."""
-    T = np.array(pair["T_reference_scan"])
-    moved = None
-    if "middle" in pair:
-        middle = np.array(pair["middle"])
-        moved = float(np.linalg.norm(middle - T[:3, :3].T @ (middle - T[:3, 3])))
-    return MergedPair(
-        pair["scan"],
-        pair["onto"],
-        pair["rms_mm"],
-        pair["overlap"],
-        pair.get("sigma_shift_mm"),
-        pair.get("sigma_turn_deg"),
-        moved,
-        float(np.degrees(np.arccos(np.clip((np.trace(T[:3, :3]) - 1) / 2, -1, 1)))),
-        pair.get("point_to_point_rms_mm"),
-    )
 
 
 def pixel_fits(session: Session) -> Mapping[Axis, PixelFit]:

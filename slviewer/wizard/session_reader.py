@@ -30,9 +30,10 @@ from slviewer.pipeline.models import (
     rejection_reason,
 )
 from slviewer.pipeline.scale import describe_scale, scale_factor
-from slviewer.pipeline.verifications import centre_spacings, read_verification
-from slviewer.records import from_plain
-from slviewer.report.data import VerificationView
+from slviewer.pipeline.stored_records import Stored, captures_of, read_record
+from slviewer.records.kinds import RECORDS
+from slviewer.records.plain import from_plain
+from slviewer.records.reconstruction import Reconstruction
 from slviewer.session.capture import Capture
 from slviewer.session.inspection_plan import Characteristic, list_plans
 from slviewer.session.measurements import FOLDER as MEASUREMENTS
@@ -46,11 +47,9 @@ from slviewer.wizard.export_files import list_exports
 from slviewer.wizard.notices import describe_error
 from slviewer.wizard.planner import Planner
 from slviewer.wizard.pose_plan import PlanInput, PoseFeatures, PosePlan
-from slviewer.wizard.result_views import merge_view
 from slviewer.wizard.snapshot import (
     CalibrationView,
     InspectionView,
-    MergeView,
     PoseState,
     PoseView,
     RigView,
@@ -171,10 +170,10 @@ class SessionReader:
         factors = {model: scale_factor(session, model) for model in models}
         inputs = _Inputs(captures, session.valid_decision("names") or {}, hashes, factors)
         poses, plan, pending = self._read_poses(captures, target, calibration, rig, focal_px)
-        verifications = self._read_verifications(inputs)
+        records = self._read_records(inputs)
+        clouds = {each.name: each for each in records if isinstance(each.record, Reconstruction)}
         verdict = self._attempt("the verdict", lambda: load_last_verdict(session), None)
         of_calibration = calibration is not None and _is_verdict_of(verdict, self._load_meta("calibration/stereo"))
-        merges = self._read_merges(inputs)
         return SessionView(
             folder=session.folder,
             target=target,
@@ -186,11 +185,8 @@ class SessionReader:
             calibration=calibration,
             verdict=verdict,
             verdict_of_calibration=of_calibration,
-            verifications=verifications,
-            distances=tuple(centre_spacings(verifications)),
-            scans=tuple(self._read_scan(c, inputs) for c in captures.values() if c.role == "scan"),
-            merge=merges[-1] if merges else None,
-            merges=len(merges),
+            records=records,
+            scans=tuple(self._read_scan(captures[name], clouds.get(name), inputs) for name in scans),
             measurements=self._attempt("the measurements", lambda: self._read_measurements(inputs), ()),
             deleted_measurements=sum(name.startswith(f"{MEASUREMENTS}/") for name in session.deleted_results()),
             nominals=list_nominals(session.folder),
@@ -369,24 +365,24 @@ class SessionReader:
 
     # verifications, scans, merges, measurements
 
-    def _read_verifications(self, inputs: _Inputs) -> tuple[VerificationView, ...]:
-        """Read the verifications of existing captures, with whether they are stale."""
+    def _read_records(self, inputs: _Inputs) -> tuple[Stored[Any], ...]:
+        """Read all records of existing captures, with whether they are stale."""
 
-        def read(result: str) -> VerificationView | None:
-            """Read one verification by its result name; None where its capture is gone."""
-            name, meta = result.removeprefix("verify/"), self._load_meta(result)
-            if name not in inputs.captures:
+        def read(result: str) -> Stored[Any] | None:
+            """Read one record by its result name; None where a capture of it is gone."""
+            (kind, _, name), meta = result.partition("/"), self._load_meta(result)
+            record = self._get_cached(("record", meta["hash"]), lambda: read_record(RECORDS[kind], meta))
+            if not set(captures_of(name, record)) <= set(inputs.captures):
                 return None
-            return read_verification(name, meta, str(inputs.labels.get(name, name)), not inputs.is_fresh(meta))
+            return Stored(name, str(inputs.labels.get(name, name)), record, not inputs.is_fresh(meta))
 
-        views = [self._attempt(name, partial(read, name), None) for name in self._list_results("verify/")]
-        return tuple(view for view in views if view is not None)
+        names = [name for kind in RECORDS for name in self._list_results(f"{kind}/")]
+        records = [self._attempt(name, partial(read, name), None) for name in names]
+        return tuple(record for record in records if record is not None)
 
-    def _read_scan(self, capture: Capture, inputs: _Inputs) -> ScanView:
+    def _read_scan(self, capture: Capture, found: Stored[Reconstruction] | None, inputs: _Inputs) -> ScanView:
         """Return the view of a scan capture: its label, and the figures and staleness of its cloud."""
-        find = partial(self._find_meta, f"clouds/{capture.name}")
-        meta: dict[str, Any] = self._attempt(f"the cloud of {capture.name}", find, {})
-        depths, read = meta.get("depth_mm"), partial(self._read_placement, capture.name, inputs)
+        read = partial(self._read_placement, capture.name, inputs)
         edits, undone = self._attempt(
             f"the edits of {capture.name}", partial(list_edits, self.session, capture.name), (tuple[str, ...](), 0)
         )
@@ -395,13 +391,8 @@ class SessionReader:
             label=str(inputs.labels.get(capture.name, capture.name)),
             purpose=capture.meta.get("settings", {}).get("purpose", "scan"),
             created=str(capture.meta.get("created", "")),
-            cloud="absent" if not meta else "fresh" if inputs.is_fresh(meta) else "stale",
-            model=meta.get("model", ""),
-            points=meta.get("points", 0),
-            depth_mm=(float(depths[0]), float(depths[1])) if depths else None,
-            noise_mm=meta.get("noise_mm"),
-            masked=meta.get("masked"),
-            scale=meta.get("scale", ""),
+            cloud="absent" if found is None else "stale" if found.stale else "fresh",
+            figures=Reconstruction() if found is None else found.record,
             thumbnail=self._thumbnails.get(capture.hash, b""),
             placement=self._attempt(f"the place of {capture.name}", read, None),
             turn_step=capture.turn_step,
@@ -413,21 +404,6 @@ class SessionReader:
         """Return where a scan is among the aligned ones; None where that is unknown or outdated."""
         meta = self._find_meta(f"{align.FOLDER}/{name}")
         return align.read_placement(name, meta) if meta and inputs.is_fresh(meta) else None
-
-    def _read_merges(self, inputs: _Inputs) -> list[MergeView]:
-        """Read the merges whose scans all exist, with whether they are stale, in the order they were made."""
-
-        def read(result: str) -> MergeView | None:
-            """Read one merge by its result name; None where a scan of it is gone."""
-            meta = self._load_meta(result)
-            if not set(meta["scans"]) <= set(inputs.captures):
-                return None
-            stale = not inputs.is_fresh(meta)
-            name = result.removeprefix("merge/")
-            return self._get_cached(("merge", meta["hash"], stale), lambda: merge_view(name, meta, stale))  # type: ignore[no-any-return]
-
-        views = [self._attempt(name, partial(read, name), None) for name in self._list_results("merge/")]
-        return [view for view in views if view is not None]
 
     def _read_measurements(self, inputs: _Inputs) -> tuple[Measurement, ...]:
         """Read all measurements, in the order they were made; stale as ``pipeline.measurements`` defines it."""

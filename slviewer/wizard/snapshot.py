@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 
@@ -18,15 +18,19 @@ from slviewer.inspection.parts import PartResult
 from slviewer.pipeline.align import Placement
 from slviewer.pipeline.capture import Space
 from slviewer.pipeline.check_results import Preflight
+from slviewer.pipeline.stored_records import Stored
 from slviewer.pipeline.suggest_exposure import ExposureSuggestion
+from slviewer.records.merge import Merge
+from slviewer.records.reconstruction import Reconstruction
+from slviewer.records.record import Record
 from slviewer.registration.refusal import Reason
-from slviewer.report.data import SpacingRow, VerificationView
 from slviewer.session.capture import TurnStep
 from slviewer.session.inspection_plan import Characteristic
 from slviewer.session.measurements import Measurement
 from slviewer.surface.region_of_interest import RegionOfInterest
 from slviewer.wizard.pose_plan import PlanInput, PosePlan
 
+R = TypeVar("R", bound=Record)
 Level = Literal["info", "good", "warning", "error"]
 PoseState = Literal["judging", "good", "refused", "excluded", "used", "unused"]
 StepState = Literal["blocked", "ready", "done"]
@@ -176,70 +180,12 @@ class ScanView:
     purpose: Literal["scan", "plane", "sphere"]
     created: str
     cloud: Literal["absent", "fresh", "stale"]
-    model: str
-    points: int
-    depth_mm: tuple[float, float] | None
-    noise_mm: float | None
+    figures: Reconstruction  # of the cloud
     thumbnail: bytes = field(repr=False)
-    masked: float | None = None  # share of the pixels outside the calibrated region; None: nothing is masked
-    scale: str = ""  # the correction of scale in the cloud, in words
     placement: Placement | None = None  # among the scans that are aligned as they come; None: it was not tried
     turn_step: TurnStep | None = None  # of a turn on a turntable
     edits: tuple[str, ...] = ()  # that are in effect, in words
     undone_edits: int = 0  # which can be redone
-
-
-@dataclass(frozen=True)
-class MergedPair:
-    """The alignment of one scan to another: RMS along the normal, and from point to point; the overlap, 0 ... 1; one
-    standard deviation of the pose, and how far the overlap's centre was moved. None where an older merge lacks it.
-    """
-
-    scan: str
-    onto: str
-    rms_mm: float
-    overlap: float
-    sigma_mm: float | None
-    sigma_deg: float | None
-    moved_mm: float | None
-    turned_deg: float
-    point_mm: float | None = None
-
-
-@dataclass(frozen=True)
-class MergedLoop:
-    """The closure error of the pairs round these scans: as registered, and after the joint adjustment."""
-
-    scans: tuple[str, ...]
-    error_mm: float
-    error_deg: float
-    adjusted_mm: float
-    adjusted_deg: float
-
-
-@dataclass(frozen=True, eq=False)
-class MergeView:
-    """The current merge: `pairs` maps each scan but the reference to (RMS mm, overlap 0 ... 1, T_reference_scan).
-
-    `registered`: the pairs that it was made from; `loops` that these close, the worst first; `dropped`: pairs that the
-    others contradict, and `refused` ones that did not register, in sentences. `stray`: {kind: number of pixels that lie
-    on no surface}; `shared`: the share of the points measured by several scans. `markers`: scan, onto,
-    number of common markers, and RMS distance of their corners in mm.
-    """
-
-    name: str
-    reference: str
-    scans: tuple[str, ...]
-    points: int
-    pairs: Mapping[str, tuple[float, float, np.ndarray]]
-    stale: bool
-    registered: tuple[MergedPair, ...] = ()
-    loops: tuple[MergedLoop, ...] = ()
-    dropped: tuple[str, ...] = ()
-    refused: tuple[str, ...] = ()
-    stray: Mapping[str, int] = field(default_factory=dict)
-    shared: float | None = None
-    markers: tuple[tuple[str, str, int, float], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -302,11 +248,8 @@ class SessionView:
     calibration: CalibrationView | None = None
     verdict: Verdict | None = None  # on the last attempt to calibrate, even if it gave no calibration
     verdict_of_calibration: bool = True  # whether that attempt made `calibration`
-    verifications: tuple[VerificationView, ...] = ()
-    distances: tuple[SpacingRow, ...] = ()
+    records: tuple[Stored[Any], ...] = ()  # in natural order of their names
     scans: tuple[ScanView, ...] = ()
-    merge: MergeView | None = None
-    merges: int = 0  # how many can be undone
     measurements: tuple[Measurement, ...] = ()
     deleted_measurements: int = 0  # how many can be restored
     nominals: tuple[str, ...] = ()  # names of the nominal models that were uploaded
@@ -327,6 +270,16 @@ class SessionView:
         """Whether the poses, all of which are judged, reach the wanted accuracy."""
         is_judged = all(pose.state != "judging" for pose in self.poses)
         return is_judged and self.plan is not None and self.plan.reaches(self.wanted_mm)
+
+    def list_records(self, kind: type[R]) -> list[Stored[R]]:
+        """Return the session's records of a kind."""
+        return [each for each in self.records if isinstance(each.record, kind)]
+
+    @property
+    def merge(self) -> Stored[Merge] | None:
+        """The current merge, the last one; None where there is none."""
+        merges = self.list_records(Merge)
+        return merges[-1] if merges else None
 
     @property
     def coverage(self) -> Coverage | None:

@@ -10,13 +10,13 @@ from slviewer.calibration.soundness import MIN_POSES
 from slviewer.evaluation.render import format_count
 from slviewer.pipeline.capture import Space
 from slviewer.pipeline.models import POSES_FOR_PIXELWISE
+from slviewer.records.merge import MIN_OVERLAP
+from slviewer.records.verification import Verification
 from slviewer.session.atomic import format_bytes
 from slviewer.wizard.snapshot import Brightness, CalibrationView, RigView, SessionView, StepState, StepView
 
 COVERED, MANY_POSES = 0.75, 15
 """Share of the coverage's goal, or number of poses, from which on the poses are enough."""
-MIN_OVERLAP = 0.3
-"""Of a merged scan with its reference; below it the alignment is doubtful."""
 
 
 @dataclass(frozen=True)
@@ -236,7 +236,7 @@ def _capture_problems(facts: Facts) -> Iterator[str]:
 
 def _verify_done(facts: Facts) -> bool:
     """Whether there is an up-to-date verification."""
-    return facts.session is not None and any(not row.stale for row in facts.session.verifications)
+    return facts.session is not None and any(not each.stale for each in facts.session.list_records(Verification))
 
 
 def _verify_instruction(facts: Facts) -> str:
@@ -249,7 +249,7 @@ def _verify_instruction(facts: Facts) -> str:
 def _verify_problems(facts: Facts) -> Iterator[str]:
     """Yield capture problems, and verifications of an older calibration."""
     yield from _capture_problems(facts)
-    if stale := sorted({row.capture for row in facts.session.verifications if row.stale}) if facts.session else []:
+    if stale := [each.name for each in facts.session.list_records(Verification) if each.stale] if facts.session else []:
         yield f"{_join_names(stale)} measured with an older calibration: measure again."
 
 
@@ -296,9 +296,12 @@ def _merge_problems(facts: Facts) -> Iterator[str]:
         return
     if merge.stale:
         yield "Scans or calibration have changed since this merge: merge again."
-    for name, (rms, overlap, _) in merge.pairs.items():
-        if overlap < MIN_OVERLAP:
-            yield f"{name} overlaps by only {100 * overlap:.0f} % (RMS {rms:.2f} mm): scan with more overlap."
+    for name, pair in merge.record.pairs.items():
+        if pair.overlap < MIN_OVERLAP:
+            yield (
+                f"{name} overlaps by only {100 * pair.overlap:.0f} % (RMS {pair.rms_mm:.2f} mm): "
+                "scan with more overlap."
+            )
 
 
 def _measure_blocked(facts: Facts) -> str:

@@ -12,21 +12,19 @@ All of them name their inputs, so that stale results are detected. The frames of
 by a job of their own (`engine`), which no cloud waits for.
 """
 
-from functools import partial
-
 from slviewer.errors import Cancelled, InputError, SlviewerError
 from slviewer.evaluation.crossvalidation import CrossValidation
 from slviewer.pipeline.align import Placement, align_scan, list_scans, load_placement
 from slviewer.pipeline.calibrate import CalibrationResult, calibrate
 from slviewer.pipeline.edit import SUPPORT, Selection, delete_points
 from slviewer.pipeline.feedback import Warn
-from slviewer.pipeline.merge import Merge, Picked, StartKind, merge
+from slviewer.pipeline.merge import MergeSettings
 from slviewer.pipeline.models import POSES_FOR_PIXELWISE, accepts_rejected, available_models
-from slviewer.pipeline.reconstruct import reconstruct
-from slviewer.pipeline.turn import WATERTIGHT, align_turn
+from slviewer.pipeline.operation import Findings
+from slviewer.pipeline.turn import WATERTIGHT, merge_turn
 from slviewer.pipeline.validate import validate
-from slviewer.pipeline.verify import Shape, Verification, verify
 from slviewer.reconstruction.cloud import Cloud
+from slviewer.records.merge import Merge
 from slviewer.session.scan_edits import load_edits
 from slviewer.session.store import Session
 from slviewer.surface.selection import select_support
@@ -82,32 +80,6 @@ def describe_comparison(compared: CrossValidation) -> str:
     return f"held-out error of the models: {figures}; {compared.recommended} is recommended"
 
 
-def reconstruct_capture(session: Session, name: str, model: str | None, report: Reporter, warn: Warn) -> int:
-    """Reconstruct a capture, with its PLY in the exports; returns the number of points."""
-    guarded, accepts = session.guarded(report.saving), accepts_rejected(session)
-    made = reconstruct(guarded, name, model=model, accept_rejected=accepts, check=False, progress=report, warn=warn)
-    return made.points
-
-
-def verify_captures(
-    session: Session, names: list[str], shape: Shape, radius: float | None, report: Reporter, warn: Warn
-) -> Verification:
-    """Compare the models on captures of a plane or a sphere; each is stored before the next is measured."""
-    guarded, accepts = session.guarded(report.saving), accepts_rejected(session)
-    return verify(
-        guarded, names, shape, radius=radius, accept_rejected=accepts, check=False, progress=report, warn=warn
-    )
-
-
-def describe_verifications(found: Verification) -> str:
-    """Describe verifications in one sentence: the RMS mm of each model on each capture."""
-    figures = {
-        name: ", ".join(f"{model} {result.rms_mm:.3f} mm" for model, result in compared.results.items())
-        for name, compared in found.captures.items()
-    }
-    return "; ".join(f"{name}: RMS {text}" for name, text in figures.items())
-
-
 def place_scans(session: Session, names: list[str], report: Reporter, warn: Warn) -> list[Placement]:
     """Align scans to those in place; by default all that are reconstructed and were not aligned yet."""
     chosen = names or [name for name in list_scans(session) if load_placement(session, name) is None]
@@ -153,32 +125,14 @@ def describe_removal(deleted: dict[str, int]) -> str:
     return f"support removed: {counts}; Undo edit brings it back"
 
 
-def merge_scans(
-    session: Session,
-    names: list[str],
-    reference: str,
-    report: Reporter,
-    warn: Warn,
-    *,
-    start: StartKind = "features",
-    angle: float | None = None,
-    picked: Picked | None = None,
-) -> Merge:
-    """Register scans to a reference, with the merged PLY in the exports."""
-    return merge(
-        session.guarded(report.saving), names, reference, start=start, angle=angle, picked=picked,
-        accept_rejected=accepts_rejected(session), progress=report, warn=warn,
-    )  # fmt: skip
-
-
-def merge_turn(session: Session, names: list[str], report: Reporter, warn: Warn) -> tuple[Merge, str]:
+def merge_scanned_turn(session: Session, names: list[str], report: Reporter, warn: Warn) -> tuple[Findings[Merge], str]:
     """Merge the scans of a turn by the angles of its turntable, and write a watertight mesh into the exports.
 
     Returns the merge, and a sentence about the mesh; where it does not close, the merge stays.
     """
-    report_merge = report.within(0, 0.7)
-    merged = align_turn(partial(merge_scans, session, names, names[0], report_merge, warn), warn)
-    number = merged.result_name.removeprefix("merge/")
+    settings = MergeSettings(names, names[0], accept_rejected=accepts_rejected(session))
+    merged = merge_turn(session.guarded(report.saving), settings, report.within(0, 0.7), warn)
+    (number,) = merged
     try:
         words = export_file(session, "merged-mesh", number, "ply", WATERTIGHT, None, report.within(0.7, 1), warn)
     except Cancelled:
@@ -190,14 +144,8 @@ def merge_turn(session: Session, names: list[str], report: Reporter, warn: Warn)
     return merged, words
 
 
-def describe_turn(reference: str, result: tuple[Merge, str]) -> str:
+def describe_turn(result: tuple[Findings[Merge], str]) -> str:
     """Describe the merge and the mesh of a turn in one sentence."""
-    merged, words = result
-    worst = max(merged.pairs.values(), key=lambda pair: pair.rms_mm)
-    return f"{len(merged.pairs) + 1} scans merged on {reference}, RMS up to {worst.rms_mm:.3f} mm; {words}"
-
-
-def describe_merge(reference: str, result: Merge) -> str:
-    """Describe a merge in one sentence: the RMS mm and overlap of each scan."""
-    pairs = (f"{n} RMS {p.rms_mm:.3f} mm, overlap {100 * p.overlap:.0f} %" for n, p in result.pairs.items())
-    return f"merged on {reference}: {'; '.join(pairs)}"
+    (merged,), words = result[0].values(), result[1]
+    worst = max(pair.rms_mm for pair in merged.pairs.values())
+    return f"{len(merged.scans)} scans merged on {merged.reference}, RMS up to {worst:.3f} mm; {words}"

@@ -24,7 +24,7 @@ from slviewer.pipeline.turn import (
 from slviewer.session.capture import TurnStep
 from slviewer.wizard import tasks
 from slviewer.wizard.capture_requests import CaptureRequests, scan_sequence
-from slviewer.wizard.merge_requests import MergeRequests
+from slviewer.wizard.merge_requests import MERGING, MergeRequests
 from slviewer.wizard.requests import request
 
 
@@ -76,7 +76,7 @@ class TurnRequests(CaptureRequests, MergeRequests):
             names = [step.name for step in recorded_steps(store, turn)]
             engine.notices.add("good", f"{turn}: {len(names)} scans all round")
             if then_merge:
-                merge = partial(tasks.merge_turn, store, names, warn=self._warner("merge"))
-                self._submit_merge(merge, partial(tasks.describe_turn, names[0]), "turntable")
+                merge = partial(tasks.merge_scanned_turn, store, names, warn=self._warner("merge"))
+                self._submit(MERGING, merge, tasks.describe_turn, self._begin_merge("turntable"))
 
         engine.acquisition.run_task("Scanning all round", work, done)

@@ -19,7 +19,7 @@ from slviewer.calibration.observe import Observation
 from slviewer.fringe.contradiction import Contradiction
 from slviewer.fringe.suspect import Suspect
 from slviewer.geometry.triangulation import triangulate_pixels
-from slviewer.records import from_plain, to_plain
+from slviewer.records.plain import from_plain, to_plain
 
 TRUE = rig()
 UPRIGHT = ((1.5, 0.1), (-0.1, 3.0))

@@ -14,7 +14,7 @@ from slviewer.calibration.drift.reference import MIN_POSES, DriftReference, buil
 from slviewer.calibration.drift.view import DriftView
 from slviewer.calibration.stereo import calibrate_stereo
 from slviewer.errors import InputError
-from slviewer.records import from_plain, to_plain
+from slviewer.records.plain import from_plain, to_plain
 from slviewer.simulation.boards import Pose
 from slviewer.simulation.rig import letter
 

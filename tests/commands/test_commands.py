@@ -46,22 +46,22 @@ def test_verify_a_plane_inside_and_a_sphere(calibrated: dict, session: Path, run
         "verify", session, "plane_03", "plane_07", "--shape", "plane", "--range", 500, 700, "--json", out
     )
     assert status == 0 and "plane_03" in text
-    captures = json.loads(out.read_text())["captures"]
+    captures = json.loads(out.read_text())["verify"]
     inside = captures["plane_03"]
     assert inside["incidence"]["R2"] == pytest.approx(100)
     assert captures["plane_07"]["incidence"]["R3"] == pytest.approx(100)
     stereo, pixelwise = inside["models"]["stereo"], inside["models"]["pixelwise"]
     assert pixelwise["noise_floor_mm"] < pixelwise["rms_mm"] < stereo["rms_mm"] < 0.5
-    assert stereo["coverage"] > 0.97 and stereo["set_aside"] < 0.02 * stereo["points"]
+    assert stereo["coverage"] > 0.97 and stereo["excluded"] < 0.02 * stereo["points"]
     status, text, _ = run("verify", session, "sphere_3", "--shape", "sphere", "--model", "stereo", "--json", out)
-    sphere = json.loads(out.read_text())["captures"]["sphere_3"]["models"]
+    sphere = json.loads(out.read_text())["verify"]["sphere_3"]["models"]
     assert list(sphere) == ["stereo"] and 97.0 < sphere["stereo"]["radius_mm"] < 99.0
 
 
 def test_reconstruct_a_board_pose_and_a_scan(calibrated: dict, session: Path, run: Run, tmp_path: Path) -> None:
     ply, grid = tmp_path / "board.ply", tmp_path / "board.npy"
     status, text, _ = run("reconstruct", session, "pose_01", "--out", ply, "--grid", grid)
-    assert status == 0 and "axis x" in text and "coverage" in text and "stereo" in text and "pixelwise" in text
+    assert status == 0 and "axis" in text and "coverage" in text and "stereo" in text and "pixelwise" in text
     points = np.load(grid)
     assert points.shape == (300, 400, 3) and points.dtype == np.float32
     cloud = trimesh.load(ply)
@@ -94,7 +94,8 @@ def test_merge_the_object(calibrated: dict, session: Path, run: Run, tmp_path: P
     ply, out = session / "exports" / "merged_1.ply", tmp_path / "merge.json"
     status, text, _ = run("merge", session, "object_r1", "object_r2", "--reference", "object_r3", "--json", out)
     assert status == 0 and "merge/1" in text
-    pairs = json.loads(out.read_text())["pairs"]
+    (merged,) = json.loads(out.read_text())["merge"].values()
+    pairs = merged["pairs"]
     assert set(pairs) == {"object_r1", "object_r2"}
     for pair in pairs.values():
         assert 0.01 < pair["rms_mm"] < 0.5 and 0.5 < pair["overlap"] <= 1
@@ -103,7 +104,7 @@ def test_merge_the_object(calibrated: dict, session: Path, run: Run, tmp_path: P
     status, text, _ = run("measure", session, "merge/1", "distance", "--at", 0, 5000)
     assert status == 0 and "distance on merge/1" in text
     status, text, _ = run("export", session, "merge", "--out", tmp_path / "all.xyz")
-    assert status == 0 and len(np.loadtxt(tmp_path / "all.xyz")) == json.loads(out.read_text())["points"]
+    assert status == 0 and len(np.loadtxt(tmp_path / "all.xyz")) == merged["points"]
 
 
 @pytest.mark.slow
@@ -115,9 +116,8 @@ def test_mesh_of_one_scan_and_of_scans_merged_on_the_way(
     status, text, _ = run("mesh", session, "object_r3", "object_r2", *thinned, "--out", stl, "--json", out)
     assert status == 0 and "smoothing" in text and "watertight" in text
     found = json.loads(out.read_text())
-    assert (
-        found["method"] == "volume" and 0.1 < found["cell_mm"] < 1.0 and set(found["merge"]["pairs"]) == {"object_r2"}
-    )
+    (merged,) = found["merge"]["merge"].values()
+    assert found["method"] == "volume" and 0.1 < found["cell_mm"] < 1.0 and set(merged["pairs"]) == {"object_r2"}
     assert 0 < found["smoothed"]["rms_mm"] < found["smoothed"]["max_mm"] < 2.0
     assert 19_000 < found["triangles"] <= 20_000 and len(trimesh.load(stl).faces) == found["triangles"]
     assert trimesh.load(tmp_path / "object_points.ply").vertices.shape[0] > 10_000

@@ -14,6 +14,9 @@ from slviewer.evaluation.incidence import incidence
 from slviewer.evaluation.render import render
 from slviewer.evaluation.tables import letter_rows
 from slviewer.reconstruction.cloud import Cloud
+from slviewer.records.plain import to_plain
+from slviewer.records.table import render_text
+from slviewer.records.verification import Verification
 
 
 def seen(points: np.ndarray, model: str, sigma: float = 0.05) -> Cloud:
@@ -73,7 +76,8 @@ def test_a_given_region_is_taken_as_it_is() -> None:
 
 def test_what_is_not_known_is_none_in_json() -> None:
     points, _ = board_before_a_wall()
-    figures = json.loads(json.dumps(compare("plane", {"stereo": seen(points, "stereo")}).to_json()))
+    record = compare("plane", {"stereo": seen(points, "stereo")}).record()
+    figures = json.loads(json.dumps(to_plain(record)))
     assert figures["incidence"] is None
     assert figures["models"]["stereo"]["coverage"] is None
     assert figures["models"]["stereo"]["radius_mm"] is None
@@ -98,8 +102,9 @@ def test_models_without_common_pixels_are_refused() -> None:
 def test_a_sphere_reports_its_radius() -> None:
     points = cloud(sphere_depth((0.0, 0.0, 650.0), 98.0), 0.04)
     result = compare("sphere", {"stereo": seen(points, "stereo", 0.04)}, radius=98.0)
-    assert result.to_json()["models"]["stereo"]["radius_mm"] == pytest.approx(98.0, abs=0.01)
-    assert "98.0" in result.text()
+    assert result.record().models["stereo"].radius_mm == pytest.approx(98.0, abs=0.01)
+    (table,) = Verification.tables({"ball": result.record()})
+    assert "98.0" in render_text(table)
 
 
 def test_incidence_counts_points_by_depth() -> None:
@@ -184,7 +189,7 @@ def test_a_plane_that_is_a_minor_part_of_the_scene_is_told_with_its_place() -> N
     rough = plane_depth(900.0) + 40.0 * np.sin(u / 6.0)
     points = cloud(np.where(board, plane_depth(), rough), 0.05)
     result = compare("plane", {"stereo": seen(points, "stereo")}, np.ones(board.shape, bool))
-    assert 0.0 < result.share < 0.5 and result.to_json()["share"] == result.share
+    assert 0.0 < result.share < 0.5 and result.record().share == result.share
     place = f"{100 * result.share:.0f} %", result.region_text()
     assert [missing_facts(warning, *place) for warning in result.warnings].count([]) == 1
     rows, columns = (np.flatnonzero(result.region.any(axis=axis)) for axis in (1, 0))

@@ -22,7 +22,7 @@ from slviewer.fringe.phase import PhaseMap
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.polynomial import fit_polynomial
 from slviewer.geometry.rig import StereoRig
-from slviewer.records import from_plain
+from slviewer.records.plain import from_plain
 from slviewer.target.board import Board
 
 SIZE, PERIOD = (200, 150), 18.0

@@ -11,7 +11,7 @@ from slviewer.errors import InputError
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.rig import StereoRig
 from slviewer.geometry.triangulation import depth_per_px, points_from_depth, triangulate, triangulate_pixels
-from slviewer.records import from_plain, to_plain
+from slviewer.records.plain import from_plain, to_plain
 
 pytestmark = pytest.mark.computes
 

@@ -16,7 +16,7 @@ from slviewer.inspection.quantities import Quantity
 from slviewer.inspection.section import CutPlane
 from slviewer.inspection.tolerance import DECIDED
 from slviewer.pipeline.measured_surface import MeasuredSurface
-from slviewer.records import to_plain
+from slviewer.records.plain import to_plain
 from slviewer.report.measurements import section_plot
 from slviewer.session.measurements import Measurement
 from slviewer.wizard.surfaces import place_at

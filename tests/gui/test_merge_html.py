@@ -2,48 +2,54 @@
 
 from html import unescape
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from facts import missing_facts
 
-from slviewer.gui.merge_html import merge_failure_html, merge_html, turntable_html, use_labels
+from slviewer.gui.merge_html import merge_failure_html, merge_html, turntable_html
 from slviewer.gui.merge_views import BY_SCAN, BY_SIGMA, OWN, SCAN_COLOURS, colour_merge
+from slviewer.gui.widgets import use_labels
+from slviewer.pipeline.stored_records import Stored, save_record
+from slviewer.records.merge import Loop, Merge, RefusedPair, Registered
 from slviewer.session.ply import write_ply
 from slviewer.session.store import Session
-from slviewer.wizard.snapshot import MergedLoop, MergedPair, MergeView
 
 LABELS = {"scan_01": "Lion <b>", "scan_02": "scan_02", "scan_03": "Lion, behind", "scan_10": "Tail"}
-PAIR = MergedPair("scan_02", "scan_01", 0.117, 0.2, 0.0231, 0.0363, 297.2, 4.46, 0.24)
+TURNED = ((1.0, 0.0, 0.0, 10.0), (0.0, 0.9, -0.1, 0.0), (0.0, 0.1, 0.9, 0.0), (0.0, 0.0, 0.0, 1.0))
+
+
+def pair(scan: str, onto: str, **figures: Any) -> Registered:
+    known = {"sigma_shift_mm": 0.0231, "sigma_turn_deg": 0.0363, "middle": (0.0, 0.0, 600.0)} | figures
+    return Registered(scan=scan, onto=onto, rms_mm=0.117, overlap=0.2, T_reference_scan=TURNED, **known)
 
 
 def test_pairs_loops_and_excluded_scans_are_named_by_labels() -> None:
-    pairs = (MergedPair("scan_03", "scan_02", 0.082, 0.99, 0.0187, 0.0286, 145.1, 9.77, 0.2), PAIR)
-    merge = MergeView(
-        name="2",
+    merge = Merge(
         reference="scan_01",
-        scans=("scan_01", "scan_02", "scan_03"),
+        scans=["scan_01", "scan_02", "scan_03"],
         points=197_971,
         pairs={},
-        stale=True,
-        registered=pairs,
-        loops=(MergedLoop(("scan_02", "scan_03", "scan_01"), 0.016, 0.0284, 0.004, 0.0059),),
-        dropped=("scan_03 -> scan_01 contradicts the other pairs by 3.1 mm and 2.0 degrees, and is left out",),
-        refused=("scan_10 -> scan_01: Only 3 % of the scan lies on the reference",),
-        stray={"edges": 5527, "grazing": 0, "unconfirmed": 8},
+        registered=[pair("scan_03", "scan_02"), pair("scan_02", "scan_01", point_to_point_rms_mm=0.24)],
+        loops=[Loop(["scan_02", "scan_03", "scan_01"], 0.016, 0.0284, 0.004, 0.0059)],
+        dropped=[RefusedPair("scan_03", "scan_01", "scan_03 -> scan_01 contradicts the other pairs by 3.1 mm")],
+        refused=[RefusedPair("scan_10", "scan_01", "Only 3 % of the scan lies on the reference")],
+        left_out={"scan_01": {"edges": 5500, "grazing": 0}, "scan_02": {"edges": 27, "unconfirmed": 8}},
         shared=0.99,
     )
-    shown = merge_html(merge, LABELS)
+    shown = merge_html(Stored("2", "2", merge, stale=True), LABELS)
     said = unescape(shown).replace("\xa0", " ")
-    assert "Lion <b>" not in shown and said.index("to Lion <b>") < said.index("to scan_02")  # the reference first
+    assert "Lion <b>" not in shown and said.index("Lion <b>") < said.index("Lion, behind")  # the reference first
     facts = (
-        "0.0231 mm<br>0.0363°", "297.20 mm<br>4.46°", "0.016 mm<br>0.0284°", "0.004 mm<br>0.0059°", "orange",
-        "0.26", "0.25 mm", "Letter", "0.24 mm", "Lion, behind -> Lion <b>", "Tail -> Lion <b>", "3 %", "197,971 points",
-        "99 %", "5,527 at depth edges", "8 contradicted", "merge again",
+        "0.117", "0.0231", "0.016", "0.004", "orange", "0.26", "0.25 mm", "Letter", "0.24 mm",
+        "Lion, behind -> Lion <b>", "Tail onto Lion <b>", "3 %", "197,971 points", "99 %", "5,527 at depth edges",
+        "8 contradicted", "Out of date",
     )  # fmt: skip
     assert missing_facts(said, *facts) == [] and "grazing" not in said
-    before = MergedPair("scan_02", "scan_01", 0.117, 0.2, None, None, None, 4.46)
-    bare = unescape(merge_html(MergeView("1", "scan_01", ("scan_01", "scan_02"), 10, {}, False, (before,)), LABELS))
-    assert "–</td>" in bare and "4.46°" in bare and "Letter" not in bare and "Loop" not in bare
+    before = pair("scan_02", "scan_01", sigma_shift_mm=None, sigma_turn_deg=None, middle=None)
+    old = Merge(reference="scan_01", scans=["scan_01", "scan_02"], points=10, pairs={}, registered=[before])
+    bare = unescape(merge_html(Stored("1", "1", old), LABELS))
+    assert "0.117" in bare and "Letter" not in bare and "Loop" not in bare and "sigma" not in bare.lower()
 
 
 def test_labels_in_messages_and_angles() -> None:
@@ -64,7 +70,8 @@ def test_merged_points_by_scan_and_by_uncertainty(tmp_path: Path) -> None:
         write_ply(store.exports / "merged_1.ply", points, np.array([10, 20, 30, 40], np.uint8), None, scalars)
         write_ply(store.exports / "merged_2.ply", points)
         for number in ("1", "2"):
-            store.save_result(f"merge/{number}", {"ply": f"merged_{number}.ply"}, {})
+            made = Merge(reference="a", scans=["a"], pairs={}, ply=f"merged_{number}.ply")
+            save_record(store, number, made, {})
         by_scan = colour_merge(store, "1", BY_SCAN, ["a", "b", "<c>"])
         assert by_scan.clouds["merged"][1][3].tolist() == list(SCAN_COLOURS[2]) and "<c>" in unescape(by_scan.legend)
         by_sigma = colour_merge(store, "1", BY_SIGMA, [])

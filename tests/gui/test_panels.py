@@ -8,6 +8,7 @@ import threading
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -35,10 +36,12 @@ from slviewer.gui.calibration_html import named_poses, verdict_html
 from slviewer.gui.inputs import display_name
 from slviewer.gui.pictures import Painter
 from slviewer.gui.steps.scan import painting, point_html, sort_scans, uncertainty
-from slviewer.gui.steps.verify import distances_table, results_table, shape_of
-from slviewer.gui.widgets import colour_range, report_table
+from slviewer.gui.steps.verify import shape_of
+from slviewer.gui.widgets import colour_range, records_html, report_table
 from slviewer.pipeline.calibration_verdict import save_verdict
-from slviewer.report.data import SpacingRow, VerificationView
+from slviewer.pipeline.stored_records import Stored
+from slviewer.records.reconstruction import Reconstruction
+from slviewer.records.verification import ModelFit, Shape, Verification
 from slviewer.report.quality import comparison_table
 from slviewer.server.secure import Serving
 from slviewer.session.measurements import Measurement
@@ -137,7 +140,7 @@ def test_plane_and_sphere_are_measured_and_exported(measured: tuple[Page, Operat
     expect(page.get_by_text("error of pixelwise; red is outwards")).to_be_visible()
     click(page, "Write CSV")
     with page.expect_download() as download:
-        page.get_by_text("Download verifications.csv").click()
+        page.get_by_text("Download figures.csv").click()
     lines = Path(download.value.path()).read_text().splitlines()
     assert lines[0].startswith("capture,name,shape,model,rms_mm") and len(lines) == 5
     assert errors == []
@@ -202,7 +205,7 @@ def test_scans_are_reconstructed_picked_merged_and_exported(
     merged = read_ply(tmp_path / "merged.ply")
     snapshot = operator.snapshot()
     assert snapshot.session is not None and snapshot.session.merge is not None
-    assert len(merged.points) == snapshot.session.merge.points and np.isfinite(merged.points).all()
+    assert len(merged.points) == snapshot.session.merge.record.points and np.isfinite(merged.points).all()
     choose(page, "Source", "Lion <b>1</b> (object_r2)")
     choose(page, "Type", "mesh")
     choose(page, "File type", "GLB")
@@ -438,7 +441,7 @@ def test_painter_draws_latest_request_and_survives_failures() -> None:
 
 def test_purpose_of_captures_and_order_of_scans() -> None:
     def scan(name: str, purpose: str = "scan") -> ScanView:
-        return ScanView(name, name, purpose, "", "fresh", "stereo", 1, None, None, b"")  # type: ignore[arg-type]
+        return ScanView(name, name, purpose, "", "fresh", Reconstruction(), b"")  # type: ignore[arg-type]
 
     assert [shape_of(scan(n)) for n in ("plane_01", "sphere_2", "object_r1")] == ["plane", "sphere", "scan"]
     assert shape_of(scan("scan_01", "plane")) == "plane"
@@ -447,18 +450,18 @@ def test_purpose_of_captures_and_order_of_scans() -> None:
 
 
 def test_tables_escape_names_and_mark_the_best() -> None:
-    def view(rms: dict[str, float], shape: str = "plane", radius: float = np.nan) -> VerificationView:
-        each = {model: 0.03 for model in rms}
-        return VerificationView(
-            "<img src=x>", shape, {"R1": 0, "R2": 90, "R3": 10}, 100, each, each, rms, each, dict.fromkeys(rms, radius)
-        )  # type: ignore[arg-type]
+    def found(rms: dict[str, float], shape: Shape = "plane", **figures: Any) -> Stored[Verification]:
+        models = {name: ModelFit(100, 0, mm, 0.03, 0.9, **figures) for name, mm in rms.items()}
+        record = Verification(shape=shape, models=models, incidence={"R1": 0, "R2": 90, "R3": 10})
+        return Stored("a", "<img src=x>", record)
 
-    html = results_table([view({"stereo": 0.2, "pixelwise": 0.1})])
+    html = records_html([found({"stereo": 0.2, "pixelwise": 0.1})])
     assert "<img" not in html and html.index("0&#46;200") < html.index("0&#46;100")
-    assert re.search(r"font-weight:600\">0&#46;100", html) and "0&#47;90&#47;10" in html
-    assert "97&#46;90" in results_table([view({"stereo": 0.2}, "sphere", 97.9)])
-    assert distances_table([SpacingRow("a to b", np.nan, {"stereo": 12.5})]).count("12&#46;500") == 1
-    assert distances_table([]) == results_table([]) == ""
+    assert re.search(r"font-weight:600\">0&#46;100", html) and html.count("90&#46;0") == 2
+    ball = found({"stereo": 0.2}, "sphere", radius_mm=97.9, centre_mm=(0.0, 0.0, 500.0))
+    other = Stored("b", "b", found({"stereo": 0.2}, "sphere", centre_mm=(12.5, 0.0, 500.0)).record)
+    assert "97&#46;900" in records_html([ball]) and records_html([ball, other]).count("12&#46;500") == 1
+    assert records_html([]) == ""
 
 
 def test_cloud_is_coloured_by_chosen_quantity() -> None:

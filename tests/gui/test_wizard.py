@@ -31,6 +31,7 @@ from wizard_page import (
 )
 
 from slviewer.gui.app import App
+from slviewer.records.verification import Verification
 from slviewer.server.secure import Serving
 from slviewer.session.store import Session
 from slviewer.wizard.operator import Operator
@@ -110,8 +111,9 @@ def test_wizard_leads_from_unknown_rig_to_merged_mesh(
         click(page, "Merge 2 scans")
         expect(page.get_by_text(re.compile("in the frame of"))).to_be_visible()
         merged = session_of(bare).merge
-        assert merged is not None and merged.reference == "scan_02" and set(merged.pairs) == {"scan_01"}
-        rms, overlap, T = merged.pairs["scan_01"]
+        assert merged is not None and merged.record.reference == "scan_02" and set(merged.record.pairs) == {"scan_01"}
+        pair = merged.record.pairs["scan_01"]
+        rms, overlap, T = pair.rms_mm, pair.overlap, np.array(pair.T_reference_scan)
         assert 0.0 < rms < 0.2 and overlap > 0.95
         assert np.linalg.norm((T @ [0, 0, 600, 1])[:3] - [0, 0, 600]) < 0.5  # the object was not moved
 
@@ -187,8 +189,13 @@ def verify(page: Page, operator: Operator) -> None:
         stand(page, shape)
         click(page, f"Capture {shape}")
         expect(page.get_by_text(f"errors on one colour scale, red is {sign}")).to_be_visible()
-    views = session_of(operator).verifications
-    rms = {(v.shape, model): mm / v.noise_floor_mm[model] for v in views for model, mm in v.rms_mm.items()}
+    views = session_of(operator).list_records(Verification)
+    rms = {
+        (view.record.shape, model): fit.rms_mm / fit.noise_floor_mm
+        for view in views
+        for model, fit in view.record.models.items()
+        if fit.rms_mm is not None and fit.noise_floor_mm is not None
+    }
     assert set(rms) == {(shape, model) for shape in ("plane", "sphere") for model in ("stereo", "pixelwise")}
     assert 0.8 < rms["plane", "pixelwise"] < 2.0 < rms["plane", "stereo"] < 8.0
     assert 0.8 < rms["sphere", "pixelwise"] < 2.0 < rms["sphere", "stereo"] < 5.0
@@ -259,9 +266,11 @@ def merge(page: Page, operator: Operator) -> None:
     click(page, "Merge 3 scans")
     expect(page.get_by_text(re.compile("in the frame of"))).to_be_visible()
     merged = session_of(operator).merge
-    assert merged is not None and merged.reference == "scan_03" and set(merged.pairs) == {"scan_01", "scan_02"}
+    assert merged is not None and merged.record.reference == "scan_03"
+    assert set(merged.record.pairs) == {"scan_01", "scan_02"}
     for name, depth in zip(("scan_01", "scan_02"), DEPTHS_MM, strict=False):
-        rms, overlap, T = merged.pairs[name]
+        pair = merged.record.pairs[name]
+        rms, overlap, T = pair.rms_mm, pair.overlap, np.array(pair.T_reference_scan)
         moved = (T @ [0, 0, depth, 1])[:3]  # the object's own place
         assert 0.02 < rms < 0.2 and overlap > 0.95
         assert 0.001 < np.linalg.norm(moved - [0, 0, DEPTHS_MM[-1]]) < 0.5
@@ -277,7 +286,7 @@ def take_home(page: Page, operator: Operator, folder: Path) -> None:
     cloud = trimesh.load(folder / "home.ply")
     merged = session_of(operator).merge
     assert merged is not None and isinstance(cloud, trimesh.PointCloud)
-    assert len(cloud.vertices) == merged.points and np.isfinite(cloud.vertices).all()
+    assert len(cloud.vertices) == merged.record.points and np.isfinite(cloud.vertices).all()
     assert cloud.extents == pytest.approx([141, 126, 31], abs=3)  # the ammonite's size, mm, less its steep rim
 
 

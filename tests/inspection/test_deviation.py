@@ -11,7 +11,7 @@ from slviewer.inspection.colours import EXCLUDED_COLOUR, colour_limit, deviation
 from slviewer.inspection.deviation import Deviation, deviation
 from slviewer.inspection.nominal_surface import NominalSurface
 from slviewer.inspection.tolerance import ToleranceVerdict, judge_deviation
-from slviewer.records import from_plain, to_plain
+from slviewer.records.plain import from_plain, to_plain
 from slviewer.registration.refusal import Refused
 from slviewer.simulation.boards import Pose
 from slviewer.simulation.mesh import MeshScene, demo_object

@@ -12,7 +12,7 @@ from slviewer.inspection.features import Feature
 from slviewer.inspection.fitting import fit_feature, least_squares
 from slviewer.inspection.quantities import Quantity
 from slviewer.inspection.uncertainty import scatter_covariance
-from slviewer.records import from_plain
+from slviewer.records.plain import from_plain
 from slviewer.session.atomic import to_json
 
 pytestmark = pytest.mark.computes

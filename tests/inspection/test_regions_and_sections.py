@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from slviewer.errors import InputError
 from slviewer.inspection.regions import Region
 from slviewer.inspection.section import CutPlane, measure_cursors, nearest_on_section, radius_through, section
-from slviewer.records import from_plain, to_plain
+from slviewer.records.plain import from_plain, to_plain
 
 
 def test_regions_hold_the_points_they_were_made_of() -> None:

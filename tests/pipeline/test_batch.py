@@ -25,6 +25,7 @@ from slviewer.pipeline.batch import batch, connect
 from slviewer.pipeline.reconstruct import reconstruct
 from slviewer.pipeline.simulate import save_true_stereo
 from slviewer.pipeline.verify import verify
+from slviewer.records.plain import to_plain
 from slviewer.session.ply import read_ply
 from slviewer.session.store import Session
 from slviewer.simulation.plans import letter_plan
@@ -176,8 +177,12 @@ def test_a_batch_makes_what_the_commands_make_and_names_what_failed(
 def test_verifications_of_a_session_become_one(session: Path, made: Path, cluster: Cluster) -> None:
     found = batch([session], "verify", captures=["sphere_*"], shape="sphere", scheduler=cluster.address)
     assert not found.failed and [done.capture for done in found.done] == list(SPHERES)
-    alone = json.dumps(verify(made, SPHERES, "sphere").to_json(), indent=2) + "\n"
-    assert made_in(session) == {"verification_sphere.json": alone.encode()}
+    alone = json.loads(json.dumps(verify(made, SPHERES, "sphere").to_json(), default=to_plain))["verify"]
+    (written,) = made_in(session).values()
+    together = json.loads(written)["verify"]
+    assert list(together) == list(SPHERES)
+    for name in SPHERES:
+        assert {**together[name], "settings": {}} == {**alone[name], "settings": {}}
 
 
 @pytest.mark.process

@@ -13,6 +13,7 @@ from clocks import HANG_S
 import slviewer as sl
 from slviewer.cli import main
 from slviewer.pipeline.certificate import make_certificate
+from slviewer.pipeline.reconstruct import ReconstructSettings
 from slviewer.session.store import Session
 from slviewer.wizard.operator import Operator
 
@@ -119,14 +120,11 @@ def test_what_the_terminal_made_is_done_in_the_wizard_and_certified(done: tuple[
     with Operator(sessions["terminal"]) as operator:
         view = operator.wait_until_idle(HANG_S).session
         assert view is not None
-        shown = {f"verify/{each.capture}" for each in view.verifications if not each.stale}
-        shown |= {f"clouds/{each.name}" for each in view.scans if each.cloud == "fresh"}
-        shown |= {f"merge/{view.merge.name}"} if view.merge is not None and not view.merge.stale else set()
+        shown = {f"{each.record.kind}/{each.name}" for each in view.records if not each.stale}
         assert set(operation.stored) <= shown
     with Session.open(sessions["terminal"]) as store:
         certificate = make_certificate(store)
-    assert set(operation.stored) <= set(certificate.results)
-    assert {name for name in operation.stored if name.startswith("verify/")} <= set(certificate.figures)
+    assert set(operation.stored) <= set(certificate.results) & set(certificate.figures)
 
 
 def test_verify_stores_the_cloud_that_reconstruct_does(recorded: Path, tmp_path: Path) -> None:
@@ -150,8 +148,9 @@ def test_a_changed_capture_makes_the_record_stale(done: tuple[Operation, dict[st
 def test_a_session_in_use_is_read_and_the_result_is_not_stored(recorded: Path, tmp_path: Path) -> None:
     session, warnings = shutil.copytree(recorded / "session", tmp_path / "session"), list[str]()
     with Session.open(session, write=True) as store:
-        made = sl.reconstruct(session, "object_r1", out=tmp_path / "cloud.ply", warn=warnings.append)
-        assert made.points > 10_000 and made.ply.is_file()
+        settings = ReconstructSettings("object_r1", out=tmp_path / "cloud.ply")
+        made = sl.reconstruct.run(session, settings, warn=warnings.append)
+        assert made.only.points > 10_000 and made.files[0].is_file()
         assert store.state_of("clouds/object_r1") == "absent"
     (warning,) = warnings
     assert "not stored" in warning and str(session) in warning

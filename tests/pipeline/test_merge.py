@@ -5,39 +5,38 @@ from pathlib import Path
 import numpy as np
 import pytest
 from facts import missing_facts, raises
+from operations import merged
 
 from slviewer.devices.simulated import simulated_rig
 from slviewer.devices.world import SimulatedWorld
 from slviewer.errors import InputError, UsageError
 from slviewer.geometry.rigid import move_points, rigid_transform
-from slviewer.gui.merge_html import merge_html
 from slviewer.pipeline.capture import capture
 from slviewer.pipeline.merge import merge
 from slviewer.pipeline.rig_choice import RigSetup
+from slviewer.records.merge import Merge
 from slviewer.registration.refusal import Refused
-from slviewer.session.store import Session
 from slviewer.simulation.boards import Pose
 from slviewer.simulation.plans import rotation
 from slviewer.simulation.rig import letter
 from slviewer.validation.bench_live import true_calibration
-from slviewer.wizard.result_views import merge_view
 
 
 @pytest.mark.process  # which Open3D starts while it is imported
 def test_starts_that_do_not_fit_together_are_refused_at_once(tmp_path) -> None:
     out = tmp_path / "merged.ply"
     with raises(UsageError, "angle"):
-        merge(tmp_path / "nowhere", ["a"], "b", out, angle=30.0)
+        merge(tmp_path / "nowhere", ["a"], "b", out=out, angle=30.0)
     points = np.eye(3)
     with raises(UsageError, "c"):
-        merge(tmp_path / "nowhere", ["a"], "b", out, picked={("a", "c"): (points, points)})
+        merge(tmp_path / "nowhere", ["a"], "b", out=out, picked={("a", "c"): (points, points)})
     with raises(Refused, "line"):
         line = np.outer([0, 1, 2], [1.0, 0, 0])
-        merge(tmp_path / "nowhere", ["a"], "b", out, picked={("a", "b"): (line, line)})
+        merge(tmp_path / "nowhere", ["a"], "b", out=out, picked={("a", "b"): (line, line)})
     with raises(UsageError, "b"):
-        merge(tmp_path / "nowhere", ["b"], "b", out)
+        merge(tmp_path / "nowhere", ["b"], "b", out=out)
     with raises(UsageError, ".ply", "merged.stl"):
-        merge(tmp_path / "nowhere", ["a"], "b", out.with_suffix(".stl"))
+        merge(tmp_path / "nowhere", ["a"], "b", out=out.with_suffix(".stl"))
 
 
 @pytest.mark.slow
@@ -58,19 +57,18 @@ def test_a_plate_is_merged_by_its_markers(tmp_path: Path) -> None:
         capture(session, name, {}, role="scan", patterns="complementary", set_up=lambda *_, bench=bench: bench)
     with raises(Refused, "markers"):
         merge(session, ["two"], "one")
-    merged = merge(session, ["two"], "one", start="markers")
+    made = merged(session, ["two"], "one", start="markers")
     T = [rigid_transform(pose.R, pose.t) for pose in poses]
-    points = merged.clouds["two"].measured[::50].astype(float)
-    gap = move_points(merged.pairs["two"].T_reference_scan, points)
+    points = made.clouds["two"].measured[::50].astype(float)
+    gap = move_points(np.array(made.record.pairs["two"].T_reference_scan), points)
     gap -= move_points(T[0] @ np.linalg.inv(T[1]), points)
     assert 0.001 < np.linalg.norm(gap, axis=1).max() < 0.08
-    (pair,) = merged.to_json()["markers"]
-    assert pair["ids"] == [0, 1, 2, 3, 4, 5] and pair["moved"] == [] and 0.001 < pair["rms_mm"] < 0.05
-    assert not missing_facts(merged.text(), 6, "markers") and merged.pairs["two"].start == "markers"
-    with Session.open(session) as store:
-        view = merge_view("1", store.load_result("merge/1", only=())[0], stale=False)
-    assert view.markers == (("two", "one", 6, pair["rms_mm"]),)
-    assert "Common markers" in merge_html(view, {})
+    (pair,) = made.record.markers
+    assert pair.ids == [0, 1, 2, 3, 4, 5] and pair.moved == [] and 0.001 < pair.rms_mm < 0.05
+    assert made.record.pairs["two"].start == "markers" and (pair.scan, pair.onto) == ("two", "one")
+    (table, *_) = Merge.tables({"1": made.record})
+    (row,) = table.rows
+    assert dict(zip([c.heading for c in table.columns], table.values(row), strict=True))["common markers"] == 6
 
 
 @pytest.mark.slow
@@ -86,7 +84,7 @@ def test_scans_without_markers_are_refused_with_what_to_do(tmp_path: Path) -> No
         capture(session, name, {}, role="scan", patterns="gray", set_up=lambda *_, bench=bench: bench)
     warnings: list[str] = []
     with raises(InputError, "slviewer target markers"):
-        merge(session, ["two"], "one", start="markers", warn=warnings.append)
+        merged(session, ["two"], "one", start="markers", warn=warnings.append)
     assert any(not missing_facts(warning, "one", "marker") for warning in warnings)
 
 
@@ -105,13 +103,13 @@ def test_the_mat_on_a_turntable_gives_its_axis(tmp_path: Path) -> None:
         poses.append(rigid_transform(world.pose.R, world.pose.t))
         bench = RigSetup(simulated_rig(world))
         capture(session, name, {}, role="scan", patterns="complementary", set_up=lambda *_, bench=bench: bench)
-    merged = merge(session, names, "one", start="turntable", angle=11.0, out=tmp_path / "merged.ply")
+    made = merged(session, names, "one", start="turntable", angle=11.0, out=tmp_path / "merged.ply")
     for k, name in enumerate(names[1:], 1):
-        points = merged.clouds[name].measured[::50].astype(float)
-        gap = move_points(merged.pairs[name].T_reference_scan, points)
+        points = made.clouds[name].measured[::50].astype(float)
+        gap = move_points(np.array(made.record.pairs[name].T_reference_scan), points)
         gap -= move_points(poses[0] @ np.linalg.inv(poses[k]), points)
         assert 0.001 < np.linalg.norm(gap, axis=1).max() < 0.1
     warnings: list[str] = []
     with raises(Refused):
-        merge(session, names, "one", start="turntable", angle=30.0, out=tmp_path / "m.ply", warn=warnings.append)
+        merged(session, names, "one", start="turntable", angle=30.0, out=tmp_path / "m.ply", warn=warnings.append)
     assert any(not missing_facts(warning, "markers", "18.0 degrees") for warning in warnings)

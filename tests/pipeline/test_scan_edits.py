@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from facts import missing_facts, raises
+from operations import merged, reconstructed
 from sound_checks import save_sound_checks
 
 from slviewer.cli import main
@@ -17,7 +18,6 @@ from slviewer.pipeline.measure import measure
 from slviewer.pipeline.measured_surface import load_surface
 from slviewer.pipeline.merge import merge
 from slviewer.pipeline.mesh import mesh
-from slviewer.pipeline.reconstruct import reconstruct
 from slviewer.pipeline.report import report
 from slviewer.pipeline.scan_edits import parse_region
 from slviewer.session.ply import read_ply
@@ -54,7 +54,7 @@ def session(made: Path, tmp_path: Path) -> Path:
 @pytest.fixture
 def cloud(session: Path, tmp_path: Path) -> np.ndarray:
     """The whole cloud of `one`, (h, w, 3) mm."""
-    return reconstruct(session, "one", out=tmp_path / "whole.ply").cloud.points
+    return reconstructed(session, "one", out=tmp_path / "whole.ply").cloud.points
 
 
 def middle_half(points: np.ndarray) -> str:
@@ -85,24 +85,24 @@ def test_every_command_uses_the_region_of_the_session(session: Path, cloud: np.n
     assert region is not None
     wanted = int(region.contains(cloud).sum())
     assert 0.4 * total < wanted < 0.6 * total
-    made = reconstruct(session, "one", out=tmp_path / "cut.ply", grid=tmp_path / "cut.npy")
+    made = reconstructed(session, "one", out=tmp_path / "cut.ply", grid=tmp_path / "cut.npy")
     assert made.points == wanted == len(read_ply(tmp_path / "cut.ply").points)
     assert count(np.load(tmp_path / "cut.npy")) == wanted
-    assert region.text() in made.text()
+    assert region.text() in " ".join(made.restrictions)
     assert len(read_ply(export(session, "cloud", "one").path).points) == wanted
     assert count(load_surface(session, "one").points) == wanted
     vertices = read_ply(mesh(session, ["one"], tmp_path / "cut_mesh.ply").out).points
     assert region.contains(np.asarray(vertices, float)).mean() > 0.999
-    merged = merge(session, ["two"], "one", tmp_path / "merged.ply", start="identity")
-    assert max(count(each.points) for each in merged.clouds.values()) < 0.65 * total
-    assert reconstruct(session, "one", out=tmp_path / "all.ply", roi="off").points == total
+    cut = merged(session, ["two"], "one", out=tmp_path / "merged.ply", start="identity")
+    assert max(count(each.points) for each in cut.clouds.values()) < 0.65 * total
+    assert reconstructed(session, "one", out=tmp_path / "all.ply", roi="off").points == total
     assert "off" in set_region(session, roi="off")
-    assert reconstruct(session, "one", out=tmp_path / "all.ply").points == total
-    assert reconstruct(session, "one", out=tmp_path / "all.ply", roi=middle_half(cloud)).points == wanted
+    assert reconstructed(session, "one", out=tmp_path / "all.ply").points == total
+    assert reconstructed(session, "one", out=tmp_path / "all.ply", roi=middle_half(cloud)).points == wanted
     set_region(session, roi="on")
-    assert reconstruct(session, "one", out=tmp_path / "all.ply").points == wanted
+    assert reconstructed(session, "one", out=tmp_path / "all.ply").points == wanted
     assert "(on)" in set_region(session, around="one")
-    assert reconstruct(session, "one", out=tmp_path / "all.ply").points > 0.995 * total
+    assert reconstructed(session, "one", out=tmp_path / "all.ply").points > 0.995 * total
 
 
 def test_a_region_of_a_file_may_be_turned(session: Path, cloud: np.ndarray, tmp_path: Path) -> None:
@@ -110,7 +110,7 @@ def test_a_region_of_a_file_may_be_turned(session: Path, cloud: np.ndarray, tmp_
     file = tmp_path / "box.toml"
     file.write_text(f"centre_mm = {centre.tolist()}\nsize_mm = [60.0, 30.0, 400.0]\nrotation_deg = [0.0, 0.0, 45.0]\n")
     region = parse_region(str(file))
-    made = reconstruct(session, "one", out=tmp_path / "cut.ply", roi=str(file))
+    made = reconstructed(session, "one", out=tmp_path / "cut.ply", roi=str(file))
     assert made.points == int(region.contains(cloud).sum()) > 100
     file.write_text("centre_mm = [1.0, 2.0]\n")
     with raises(InputError, "centre_mm"):
@@ -126,8 +126,8 @@ def test_a_region_beside_the_scan_is_refused_with_numbers(session: Path, tmp_pat
         facts[name] = (name, f"{count(cloud)} points", f"z {depths.min():.0f} to {depths.max():.0f} mm")
     box = "0,1,0,1,10,20"
     for name, compute in (
-        ("one", lambda: reconstruct(session, "one", roi=box)),
-        ("two", lambda: merge(session, ["two"], "one", tmp_path / "m.ply", start="identity", roi=box)),
+        ("one", lambda: reconstructed(session, "one", roi=box)),
+        ("two", lambda: merged(session, ["two"], "one", out=tmp_path / "m.ply", start="identity", roi=box)),
         ("one", lambda: measure(session, "one", "plane", ball=(0, 0, 500, 20), roi=box)),
     ):
         with raises(InputError, *facts[name]):
@@ -139,7 +139,7 @@ def test_a_region_beside_the_scan_is_refused_with_numbers(session: Path, tmp_pat
         (str(tmp_path / "none.toml"), "none.toml"),
     ):
         with raises(UsageError, fact):
-            reconstruct(session, "one", roi=wrong)
+            reconstructed(session, "one", roi=wrong)
     assert main(["reconstruct", str(session), "one", "--roi=-1,1,-1,1,10,20"]) == 1
     assert not missing_facts(capfd.readouterr().err, *facts["one"])
     assert main(["region", str(session), "--roi=-500,500,-500,500,10,2000"]) == 0
@@ -154,7 +154,7 @@ def test_edits_are_stored_undone_and_redone(session: Path, cloud: np.ndarray, tm
     left = count(cloud[:, : int(half[2]) + 1])
     assert 0.4 * total < left < 0.6 * total
     assert edited.remaining == total - left
-    assert reconstruct(session, "one", out=tmp_path / "cut.ply").points == total - left
+    assert reconstructed(session, "one", out=tmp_path / "cut.ply").points == total - left
     assert len(edited.edits) == 1 and f"{left:,}" in edited.edits[0]
     rows, columns = np.nonzero(np.isfinite(cloud[..., 2]) & (np.arange(w) > half[2]))
     part = (int(columns[500]), int(rows[500]))
@@ -165,9 +165,9 @@ def test_edits_are_stored_undone_and_redone(session: Path, cloud: np.ndarray, tm
     edit_scan(session, "one", polygon=[0, -1, w, -1, w, rows[500], 0, rows[500]], invert=True)
     assert len(load(session).active) == 2
     assert edit_scan(session, "one", undo=2).undone == 2
-    assert reconstruct(session, "one", out=tmp_path / "cut.ply").points == total
+    assert reconstructed(session, "one", out=tmp_path / "cut.ply").points == total
     assert edit_scan(session, "one", redo=1).undone == 1
-    assert reconstruct(session, "one", out=tmp_path / "cut.ply").points == total - left
+    assert reconstructed(session, "one", out=tmp_path / "cut.ply").points == total - left
     assert main(["edit", str(session), "one"]) == 0
     assert "1. polygon" in capfd.readouterr().out
     with raises(InputError, "undone"):
@@ -250,4 +250,4 @@ def test_edits_of_another_capture_or_damaged_ones_are_not_applied(session: Path,
     file = next((session / "results/edits/two/arrays").glob("*.npy"))
     file.write_bytes(file.read_bytes()[:-3])
     with raises(DamagedError):
-        reconstruct(session, "two")
+        reconstructed(session, "two")

@@ -5,6 +5,7 @@ import numpy as np
 from slviewer.calibration.stereo import StereoModel
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.rig import StereoRig
+from slviewer.records.verification import ModelFit, Verification
 from slviewer.report.data import (
     CalibrationFigures,
     CaptureRow,
@@ -15,12 +16,13 @@ from slviewer.report.data import (
     PixelFitView,
     PlaneRow,
     PoseResiduals,
+    RecordsView,
     ReproductionData,
     SessionData,
     SpacingRow,
     SphereRow,
-    VerificationView,
 )
+from slviewer.report.maps import verification_maps
 
 MODELS = ("stereo", "pixelwise")
 INCIDENCE = ((100, 0), (91.2, 8.8), (0, 100), (0, 100), (0, 47.6), (0, 0.7), (0, 0), (0, 0), (2.1, 97.9), (0, 87))
@@ -234,20 +236,21 @@ def session_data(width: int = 1600) -> SessionData:
     D = np.array([-0.0812, 0.113, 0.0003, -0.0002, -0.04])
     a = np.radians(14.0)
     R = np.array([[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]])
-    planes = [
-        VerificationView(
-            row.name,
-            "plane",
-            row.incidence,
-            812_345,
-            {"stereo": 1200, "pixelwise": 24000 if i else 900},
-            {"stereo": 0.993, "pixelwise": 0.981},
-            row.rms_mm,
-            row.noise_floor_mm,
-            maps=error_maps(row.name, width, dict(row.rms_mm), i),
-        )
-        for i, row in enumerate(plane_rows()[:3:2])
-    ]
+    planes, maps = {}, []
+    for i, row in enumerate(plane_rows()[:3:2]):
+        fits = {
+            model: ModelFit(
+                points=812_345,
+                excluded=24000 if i and model == "pixelwise" else 1200,
+                rms_mm=row.rms_mm[model],
+                noise_floor_mm=row.noise_floor_mm[model],
+                coverage=0.981,
+            )
+            for model in row.rms_mm
+        }
+        planes[row.name] = Verification(shape="plane", models=fits, incidence=dict(row.incidence))
+        drawn = error_maps(row.name, width, dict(row.rms_mm), i).maps
+        maps.append(verification_maps(row.name, planes[row.name], {f"error_{m}": array for m, array in drawn.items()}))
     rig = StereoRig(
         Lens(K, D, (width, height)), Lens(K * [[0.4], [0.8], [1]], -D, (912, 1140)), R, np.array([-178.2, 0.4, 21.3])
     )
@@ -268,6 +271,6 @@ def session_data(width: int = 1600) -> SessionData:
         captures=captures,
         calibration=CalibrationFigures(stereo, residuals),
         pixel_fits=[PixelFitView("x", rms_maps(width), np.full((height, width), 17, np.uint16))],
-        verifications=planes,
+        records=[RecordsView(Verification, planes, maps)],
         warnings=["the camera's exposure changed between pose_03 and pose_04: brightness differs by 20 %"],
     )

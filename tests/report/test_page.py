@@ -9,7 +9,8 @@ import pytest
 from facts import raises
 
 from slviewer.errors import InputError
-from slviewer.report.page import Cell, Column, Figure, Headline, PageNotice, Section, Table, write_page
+from slviewer.records.table import Cell, Column, Table
+from slviewer.report.page import Figure, Headline, PageNotice, Section, write_page
 
 PIXELS = np.zeros((4, 300, 3), np.uint8)
 EVIL = "<script>alert('x')</script> \"quoted\" & <img src=y onerror=z>"

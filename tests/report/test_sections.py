@@ -13,8 +13,9 @@ from slviewer.calibration.diagnosis.verdict import Finding, Verdict
 from slviewer.calibration.drift.check import Drift
 from slviewer.calibration.stereo import StereoModel
 from slviewer.evaluation.crossvalidation import CrossValidation, HeldOutPose
+from slviewer.records.table import Cell, Table
 from slviewer.report.data import AcceptanceView, CalibrationFigures, DriftRow, ModelsView, PlaneRow, SpacingRow
-from slviewer.report.page import Cell, Figure, PageNotice, Section, Table, write_page
+from slviewer.report.page import Figure, PageNotice, Section, write_page
 from slviewer.report.reproduction import (
     inside_ratio,
     reproduction_headlines,
@@ -34,7 +35,7 @@ def texts(section: Section) -> str:
     for item in section.items:
         if isinstance(item, Table):
             cells = [c for row in (*item.rows, *item.footer) for c in row]
-            words += [item.caption, *item.notes, *(c.text if isinstance(c, Cell) else c for c in cells)]
+            words += [item.caption, *item.notes, *(str(c.value if isinstance(c, Cell) else c) for c in cells)]
         else:
             words.append(item.text if isinstance(item, PageNotice) else item.caption)
     return "\n".join(words)
@@ -144,14 +145,14 @@ def test_missing_values_are_dashes_not_winners() -> None:
     row = PlaneRow("p", {}, {"stereo": 0.1, "pixelwise": nan}, {"stereo": nan})
     cells = by_title(plane_table([row], "t"), 0)
     assert cells["", "R1 / R2 / R3"] == cells["pixelwise", "RMS"] == Cell("–", "muted")
-    assert cells["stereo", "RMS"] == "0.100" and cells["pixelwise", "against stereo"] == Cell("–", "muted")
+    assert cells["stereo", "RMS"] == "0.100" and cells["pixelwise", "against stereo"] == Cell(None)
     assert ("the Letter's rig", "stereo") not in cells
 
 
 def test_verdicts() -> None:
     assert compare_errors(0.1, 0.25) == Cell("2.50 × better", "better")
     assert compare_errors(-0.25, 0.1) == Cell("2.50 × worse", "worse")
-    assert compare_errors(0.100, 0.101) == "equal" and better_worse(0.100, 0.101) == ""
+    assert compare_errors(0.100, 0.101) == Cell("equal") and better_worse(0.100, 0.101) == ""
     assert format_number(-0.5, signed=True) == "−0.500" and format_number(0.5, 1, signed=True) == "+0.5"
 
 
@@ -184,7 +185,7 @@ def test_a_sessions_report(tmp_path: Path) -> None:
 
 def test_a_session_with_nothing_in_it() -> None:
     data = dataclasses.replace(
-        session_data(WIDTH), captures=[], calibration=None, pixel_fits=(), verifications=(), warnings=()
+        session_data(WIDTH), captures=[], calibration=None, pixel_fits=(), records=(), warnings=()
     )
     (section,) = session_sections(data)
     assert missing_facts(texts(section), "captures") == [] and session_headlines(data) == []
@@ -194,7 +195,7 @@ def test_a_calibration_made_elsewhere() -> None:
     data = session_data(WIDTH)
     assert data.calibration is not None
     bare = CalibrationFigures(StereoModel.from_rig(data.calibration.stereo.rig))
-    sections = session_sections(dataclasses.replace(data, calibration=bare, verifications=(), pixel_fits=()))
+    sections = session_sections(dataclasses.replace(data, calibration=bare, records=(), pixel_fits=()))
     assert missing_facts(texts(sections[1]), "elsewhere") == []
 
 

@@ -84,9 +84,12 @@ def test_an_entry_of_another_type_is_damage(session, key, value):
 
 
 def test_an_entry_that_is_missing_is_damage(session):
+    session.save_result("poses/one", {}, {})
+    with raises(DamagedError, "poses/one", "'target'"):
+        session.load_result("poses/one")[0]["target"]
     session.save_result("merge/1", {}, {})
-    with raises(DamagedError, "merge/1", "'scans'"):
-        session.load_result("merge/1")[0]["scans"]
+    with raises(DamagedError, "merge/1", "reference"):  # of a record
+        session.load_result("merge/1")
 
 
 def test_inputs_that_form_a_circle_or_many_paths_are_examined_once(session, monkeypatch):

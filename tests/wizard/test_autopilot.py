@@ -1,5 +1,6 @@
 """The autopilot runs the wizard on a small rig; then everything that can be looked at, exported and undone."""
 
+import csv
 import importlib
 import shutil
 import zipfile
@@ -16,6 +17,7 @@ from small_fields import fit_few_cells
 from wizard_events import HANG_S, SPARING, list_texts
 
 from slviewer.errors import Cancelled
+from slviewer.records.verification import Verification
 from slviewer.session.ply import read_ply
 from slviewer.session.store import Session
 from slviewer.wizard import result_views, tasks
@@ -91,16 +93,18 @@ def assert_all_is_measured(snapshot: Snapshot, acts: list[str]) -> None:
     assert splined is not None and splined.summary["noise_px"]["x"] < 0.03
     assert splined.summary["cells_lit"]["camera"] > 0.8
     assert set(splined.weights) == set(calibration.stereo.poses) and not splined.summary["left_out"]
-    plane, sphere = ({v.capture: v for v in session.verifications}[name] for name in ("plane_01", "sphere_01"))
-    assert plane.rms_mm["splined"] < plane.rms_mm["pixelwise"] < plane.rms_mm["stereo"] < 0.5
-    assert "splined" in plane.masked and "stereo" not in plane.masked
-    assert plane.noise_floor_mm["pixelwise"] < plane.rms_mm["pixelwise"]
-    assert sphere.radius_mm["pixelwise"] == pytest.approx(98, abs=0.5)
+    found = {each.name: each.record.models for each in session.list_records(Verification)}
+    plane, sphere = found["plane_01"], found["sphere_01"]
+    assert plane["splined"].rms_mm < plane["pixelwise"].rms_mm < plane["stereo"].rms_mm < 0.5  # type: ignore[operator]
+    assert plane["splined"].masked is not None and plane["stereo"].masked is None
+    assert plane["pixelwise"].noise_floor_mm < plane["pixelwise"].rms_mm  # type: ignore[operator]
+    assert sphere["pixelwise"].radius_mm == pytest.approx(98, abs=0.5)
     merge = session.merge
-    assert merge is not None and set(merge.pairs) == {"scan_01", "scan_02"} and merge.reference == "scan_03"
-    assert all(0.01 < rms < 0.5 and overlap > 0.5 for rms, overlap, _ in merge.pairs.values())
+    assert merge is not None and merge.record.reference == "scan_03"
+    assert set(merge.record.pairs) == {"scan_01", "scan_02"}
+    assert all(0.01 < pair.rms_mm < 0.5 and pair.overlap > 0.5 for pair in merge.record.pairs.values())
     merged = read_ply(next(e.path for e in session.exports if e.name == "merged_1.ply"))
-    assert len(merged.points) == merge.points > 30_000
+    assert len(merged.points) == merge.record.points > 30_000
     assert next(scan.label for scan in session.scans if scan.purpose == "scan") == "Ammonite, near"
     sphere, width = session.measurements
     radius = sphere.quantities[0]
@@ -203,8 +207,10 @@ def test_files_for_other_programs(operator: Operator) -> None:
     cloud = read_ply(files["merged_1.ply"].path)
     gaps = cKDTree(surface.vertices).query(cloud.points[::200])[0]
     assert len(surface.faces) > 5_000 and np.median(gaps) < 1.0
-    table = files["verifications.csv"].path.read_text().splitlines()
-    assert len(table) == 7 and table[1].startswith("plane_01,A flat plate,plane,stereo,")
+    rows = list(csv.DictReader(files["figures.csv"].path.read_text().splitlines()))
+    verified = [row for row in rows if row["kind"] == "verify" and row["model"]]
+    assert len(verified) == 6 and {row["kind"] for row in rows} == {"verify", "clouds", "merge"}
+    assert [verified[0][key] for key in ("record", "label", "model")] == ["plane_01", "A flat plate", "stereo"]
     bundle = next(export for export in files.values() if export.name.startswith("diagnostics_"))
     with zipfile.ZipFile(bundle.path) as inside:
         names = inside.namelist()
@@ -232,10 +238,12 @@ def test_a_scale_that_was_applied_is_in_the_clouds_and_makes_older_ones_stale(op
     assert session.calibration is not None and session.calibration.chosen == "splined"
     assert set(session.calibration.scales) == {"splined"}
     assert missing_facts(session.calibration.scales["splined"], "+1000 ppm", "lab 7") == []
-    assert {scan.cloud for scan in session.scans} == {"stale"} and all(view.stale for view in session.verifications)
+    assert {scan.cloud for scan in session.scans} == {"stale"} and all(
+        view.stale for view in session.list_records(Verification)
+    )
     assert operator.reconstruct("scan_02")
     scan = operator.wait_until_idle(HANG_S).scan("scan_02")
-    assert scan is not None and scan.cloud == "fresh" and missing_facts(scan.scale, "+1000 ppm", "lab 7") == []
+    assert scan is not None and scan.cloud == "fresh" and missing_facts(scan.figures.scale, "+1000 ppm", "lab 7") == []
     after = result_views.scan_cloud(store, "scan_02").points
     both = np.isfinite(before[..., 2]) & np.isfinite(after[..., 2])
     np.testing.assert_allclose(after[both], before[both] * np.float32(1.001), rtol=1e-6)
@@ -258,7 +266,9 @@ def test_what_changes_makes_stale_what_came_from_it(operator: Operator) -> None:
     )
     assert session.calibration.models == ("stereo", "pixelwise")  # what was made of other poses is gone
     assert any(not missing_facts(notice.text, "splined", 8, 7) for notice in again.notices)
-    assert {scan.cloud for scan in session.scans} == {"stale"} and all(view.stale for view in session.verifications)
+    assert {scan.cloud for scan in session.scans} == {"stale"} and all(
+        view.stale for view in session.list_records(Verification)
+    )
     assert session.merge is not None and session.merge.stale and again.step("merge").state == "ready"
     assert again.pose("pose_02").state == "excluded"  # type: ignore[union-attr]
     assert operator.reconstruct("scan_01")

@@ -1,7 +1,6 @@
 """Merging as an operator asks for it: from each start, and refused in words that stay."""
 
 from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,6 +11,8 @@ from wizard_events import HANG_S
 from slviewer.fringe.presets import p18
 from slviewer.fringe.sequence import one_axis
 from slviewer.pipeline.simulate import save_true_stereo
+from slviewer.pipeline.stored_records import Stored, read_record
+from slviewer.records.merge import Merge
 from slviewer.session.ply import read_ply
 from slviewer.session.store import Session
 from slviewer.simulation.boards import Pose
@@ -21,8 +22,7 @@ from slviewer.simulation.rig import letter
 from slviewer.simulation.scenes import Spheres
 from slviewer.wizard import result_views
 from slviewer.wizard.operator import Operator
-from slviewer.wizard.result_views import merge_view
-from slviewer.wizard.snapshot import MergeView, Snapshot
+from slviewer.wizard.snapshot import Snapshot
 
 pytestmark = pytest.mark.computes
 
@@ -53,13 +53,13 @@ def operator(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Operator]:
         yield engine
 
 
-def settled(operator: Operator) -> tuple[Snapshot, MergeView | None]:
+def settled(operator: Operator) -> tuple[Snapshot, Stored[Merge] | None]:
     snapshot = operator.wait_until_idle(HANG_S)
     assert snapshot.session is not None
     return snapshot, snapshot.session.merge
 
 
-def name_of(merge: MergeView | None) -> str:
+def name_of(merge: Stored[Merge] | None) -> str:
     """Return the name of a merge; empty where there is none."""
     return "" if merge is None else merge.name
 
@@ -72,9 +72,9 @@ def truth(name: str) -> np.ndarray:
     return np.asarray(first @ np.linalg.inv(scan))
 
 
-def off_mm(merge: MergeView, name: str) -> float:
+def off_mm(merge: Stored[Merge], name: str) -> float:
     """How far the object's middle lies from where it should."""
-    D = merge.pairs[name][2] @ np.linalg.inv(truth(name))
+    D = np.array(merge.record.pairs[name].T_reference_scan) @ np.linalg.inv(truth(name))
     return float(np.linalg.norm(D[:3, :3] @ MIDDLE + D[:3, 3] - MIDDLE))
 
 
@@ -82,23 +82,25 @@ def off_mm(merge: MergeView, name: str) -> float:
 def test_three_scans_close_a_loop_and_say_how_sure_they_are(operator: Operator) -> None:
     assert operator.merge(NAMES, "first")
     snapshot, merge = settled(operator)
-    assert merge is not None and snapshot.merge_failure == "" and merge.reference == "first"
-    assert {(pair.scan, pair.onto) for pair in merge.registered} == {
+    assert merge is not None and snapshot.merge_failure == "" and merge.record.reference == "first"
+    assert {(pair.scan, pair.onto) for pair in merge.record.registered} == {
         ("second", "first"), ("third", "first"), ("third", "second"),
     }  # fmt: skip
-    for pair in merge.registered:
-        assert 0.01 < pair.rms_mm < 0.5 and 0.4 < pair.overlap <= 1 and pair.point_mm > pair.rms_mm  # type: ignore[operator]
-        assert 0 < pair.sigma_mm < 0.05 and 0 < pair.sigma_deg < 0.1  # type: ignore[operator]
+    for pair in merge.record.registered:
+        assert 0.01 < pair.rms_mm < 0.5 and 0.4 < pair.overlap <= 1 and pair.point_to_point_rms_mm > pair.rms_mm  # type: ignore[operator]
+        assert 0 < pair.sigma_shift_mm < 0.05 and 0 < pair.sigma_turn_deg < 0.1  # type: ignore[operator]
         steps = NAMES.index(pair.scan) - NAMES.index(pair.onto)
         assert pair.turned_deg == pytest.approx(steps * STEP_DEG, abs=0.1)
         assert 0.5 < pair.moved_mm < 30  # type: ignore[operator]  # the middle of what both see, not the camera's
-    (loop,) = merge.loops
-    assert loop.error_mm < 0.3 and loop.adjusted_mm <= loop.error_mm and set(loop.scans) == set(NAMES)
-    assert merge.dropped == merge.refused == () and 0.5 < merge.shared <= 1 and sum(merge.stray.values()) > 0  # type: ignore[operator]
+    (loop,) = merge.record.loops
+    assert loop.error_mm < 0.3 and loop.left_mm <= loop.error_mm and set(loop.scans) == set(NAMES)
+    record = merge.record
+    assert record.dropped == record.refused == [] and record.excluded.total() > 0
+    assert record.shared is not None and 0.5 < record.shared <= 1
     assert all(off_mm(merge, name) < 0.1 for name in NAMES[1:])
     assert operator.session is not None
     kept = read_ply(operator.session.exports / f"merged_{merge.name}.ply")
-    assert set(np.unique(kept.scalars["source"])) == {0, 1, 2} and len(kept.points) == merge.points
+    assert set(np.unique(kept.scalars["source"])) == {0, 1, 2} and len(kept.points) == merge.record.points
     assert not [notice for notice in snapshot.notices if notice.level == "error"]
 
 
@@ -128,7 +130,7 @@ def test_picked_pairs_start_a_merge(operator: Operator) -> None:
     here = there @ T[:3, :3].T + T[:3, 3] + np.random.default_rng(0).normal(0, 1.5, there.shape)
     assert operator.merge(["first", "third"], "first", picked={("third", "first"): (there, here)})
     snapshot, merge = settled(operator)
-    assert merge is not None and merge.scans == ("first", "third") and off_mm(merge, "third") < 0.1
+    assert merge is not None and merge.record.scans == ["first", "third"] and off_mm(merge, "third") < 0.1
     assert any(not missing_facts(notice.text, "third", "first", "picked points") for notice in snapshot.notices)
     line = np.outer([0, 1, 2], [10.0, 0, 0]) + MIDDLE
     assert operator.merge(["first", "third"], "first", picked={("third", "first"): (line, line)})
@@ -146,20 +148,21 @@ def test_scans_as_they_lie_need_no_search_and_a_ball_holds_nothing(operator: Ope
     assert missing_facts(snapshot.merge_failure, "sphere", "coded markers") == []
 
 
-def off_mm_between(merge: MergeView) -> float:
+def off_mm_between(merge: Stored[Merge]) -> float:
     """How far the middle of the first scan's object lies from where it should on the second."""
-    D = merge.pairs["first"][2] @ truth("second")
+    D = np.array(merge.record.pairs["first"].T_reference_scan) @ truth("second")
     return float(np.linalg.norm(D[:3, :3] @ MIDDLE + D[:3, 3] - MIDDLE))
 
 
-def test_a_merge_of_before_that_kept_less_is_shown(tmp_path: Path) -> None:
+def test_a_merge_of_before_that_kept_less_is_shown() -> None:
     T = np.eye(4)
     T[:3, :3] = Rotation.from_euler("y", 5, degrees=True).as_matrix()
     pair = {"rms_mm": 0.2, "overlap": 0.8, "T_reference_scan": T.tolist()}
-    view = merge_view("3", {"reference": "a", "scans": ["a", "b"], "points": 10, "pairs": {"b": pair}}, stale=True)
-    (shown,) = view.registered
-    assert (shown.scan, shown.onto, shown.sigma_mm, shown.moved_mm) == ("b", "a", None, None)
-    assert shown.turned_deg == pytest.approx(5) and view.loops == () and view.shared is None and view.stale
+    meta = {"reference": "a", "scans": ["a", "b"], "points": 10, "pairs": {"b": pair}}
+    merge = read_record(Merge, meta)
+    (shown,) = merge.registered
+    assert (shown.scan, shown.onto, shown.sigma_shift_mm, shown.moved_mm) == ("b", "a", None, None)
+    assert shown.turned_deg == pytest.approx(5) and merge.loops == [] and merge.shared is None
 
 
 @pytest.mark.slow

@@ -52,7 +52,7 @@ def test_one_request_ends_in_a_watertight_mesh(operator: Operator) -> None:
     assert turned(done) == [(f"turn1_{k + 1:02d}", 30.0 * k, "fresh") for k in range(12)]
     assert any(not missing_facts(stage, "3 of 12", "frame") for stage in stages)
     assert done.session is not None and done.session.merge is not None and done.merge_failure == ""
-    assert len(done.session.merge.scans) == 12 and operator.session is not None
+    assert len(done.session.merge.record.scans) == 12 and operator.session is not None
     (path,) = (operator.session.folder / "exports").glob("merged*mesh*.ply")
     mesh = trimesh.load(path, process=False)
     assert mesh.is_watertight and mesh.volume > 3e5

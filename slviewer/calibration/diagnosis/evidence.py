@@ -11,7 +11,7 @@ from slviewer.calibration.soundness import MIN_TILT_SPREAD_DEG
 from slviewer.fringe.contradiction import Contradiction
 from slviewer.fringe.sequence import Axis
 from slviewer.fringe.suspect import Suspect
-from slviewer.records import from_plain
+from slviewer.records.plain import from_plain
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
 from slviewer.calibration.splined.residual_noise import Noise
-from slviewer.records import to_plain
+from slviewer.records.plain import to_plain
 
 Level = Literal["good", "doubtful", "rejected"]
 Severity = Literal["note", "doubtful", "rejected"]

@@ -15,7 +15,7 @@ from slviewer.calibration.splined.posterior import compute_point_jacobian
 from slviewer.calibration.splined.residual_noise import Noise
 from slviewer.calibration.splined.unknowns import Arrangement, State
 from slviewer.fringe.sequence import Axis
-from slviewer.records import from_plain, to_plain
+from slviewer.records.plain import from_plain, to_plain
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from slviewer.evaluation.acceptance.artefact import Artefact
 from slviewer.evaluation.acceptance.figures import K_95, K_997, RULE, Decision, Judgement, judge
 from slviewer.evaluation.acceptance.measure import FLATNESS, FORM, SIZE, SPACING, Position
 from slviewer.evaluation.render import Row, render
-from slviewer.records import to_plain
+from slviewer.records.plain import to_plain
 
 POSITIONS = {"ball-bar": 7, "sphere": 7, "plane": 6}
 CLAIM = "follows the ideas of VDI/VDE 2634 part 2 and ISO 10360-13, and claims conformity with neither"

@@ -10,7 +10,7 @@ import viser
 from slviewer.errors import SlviewerError
 from slviewer.gui.inputs import Choice, change, display_name
 from slviewer.gui.panel import PanelContext, StepPanel
-from slviewer.gui.widgets import Html, Text, coloured, link, paragraph, table, to_html
+from slviewer.gui.widgets import Html, Text, coloured, link, paragraph, records_html, table, to_html
 from slviewer.pipeline.export import (
     What,
     default_file_name,
@@ -19,6 +19,7 @@ from slviewer.pipeline.export import (
     formats,
 )
 from slviewer.pipeline.white_balance import BOARD
+from slviewer.records.kinds import RECORDS
 from slviewer.session.atomic import format_bytes
 from slviewer.session.mesh_files import mesh_formats, point_formats
 from slviewer.surface.meshing import MeshingPlan, Method
@@ -146,10 +147,15 @@ class Panel(StepPanel):
             self._write_numbers = context.button(
                 "Write calibration", self._request_numbers, viser.Icon.FILE_EXPORT, None
             )
+        with gui.add_folder("Figures", visible=False, expand_by_default=False) as self._figures_folder:
+            self._figures = Text(gui)
         with gui.add_folder("Report and tables"):
             self._report = context.button("Write report", operator.report, viser.Icon.REPORT, None)
             self._table = context.button(
-                "Write verifications", lambda: operator.export("table"), viser.Icon.TABLE_EXPORT, hint="As a CSV table"
+                "Write figures",
+                lambda: operator.export("table"),
+                viser.Icon.TABLE_EXPORT,
+                hint="All verifications, clouds and merges as a CSV table",
             )
             context.button(
                 "Collect diagnostics", operator.diagnostic_bundle, viser.Icon.STETHOSCOPE,
@@ -180,7 +186,10 @@ class Panel(StepPanel):
         change(self._write_numbers, disabled=busy or not ready or refused)
         for button in (self._write, self._finish):
             change(button, disabled=busy or not things or refused)
-        change(self._table, disabled=busy or not session.verifications)
+        change(self._table, disabled=busy or not session.records)
+        change(self._figures_folder, visible=bool(session.records))
+        labels = {scan.name: scan.label for scan in session.scans}
+        self._figures.set("".join(records_html(session.list_records(kind), labels) for kind in RECORDS.values()))
         self._describe()
 
     def show(self, visible: bool) -> None:
@@ -242,7 +251,10 @@ class Panel(StepPanel):
             self._painter.cancel("cloud")
             self._scene.clear(LAYER)
             return
-        clouds = {scan.name: (scan.points, scan.model, session.restriction(scan.name)) for scan in session.scans}
+        clouds = {
+            scan.name: (scan.figures.points, scan.figures.model, session.restriction(scan.name))
+            for scan in session.scans
+        }
 
         def load() -> tuple[np.ndarray, np.ndarray | None]:
             """Load points (..., 3) mm and colours of the source; None: it has no colours."""
@@ -352,8 +364,8 @@ def _points(session: SessionView, name: str) -> tuple[int, str]:
     """Return the number of points of a scan or the merge, and a scan's model."""
     scan = next((each for each in session.scans if each.name == name), None)
     if scan is not None:
-        return scan.points, scan.model
-    return session.merge.points if session.merge else 0, ""
+        return scan.figures.points, scan.figures.model
+    return session.merge.record.points if session.merge else 0, ""
 
 
 def _get_export(session: SessionView, name: str) -> ExportView | None:

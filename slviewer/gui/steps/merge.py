@@ -14,7 +14,9 @@ from slviewer.gui.panel import PanelContext, StepPanel
 from slviewer.gui.point_editing import PointEditing
 from slviewer.gui.steps.verify import shape_of
 from slviewer.gui.widgets import Text
-from slviewer.wizard.snapshot import MergeView, ScanView, SessionView, Snapshot
+from slviewer.pipeline.stored_records import Stored
+from slviewer.records.merge import Merge
+from slviewer.wizard.snapshot import ScanView, SessionView, Snapshot
 
 LAYER, EDITS = "merge", "merge edits"
 FEATURES, MARKERS, PLACED, TURNTABLE = "features", "markers", "places while scanning", "turntable"
@@ -78,7 +80,7 @@ class Panel(StepPanel):
             scans = _list_mergeable(session) if session else []
             self._draw_boxes(scans)
             merge = session.merge if session else None
-            preferred = merge.reference if merge else scans[-1].name if scans else ""
+            preferred = merge.record.reference if merge else scans[-1].name if scans else ""
             self._reference.offer([(scan.name, display_name(scan.name, scan.label)) for scan in scans], preferred)
             change(self._alignment_folder, visible=len(scans) > 1)
             change(self._undo, visible=merge is not None)
@@ -117,7 +119,7 @@ class Panel(StepPanel):
                 self._boxes[scan.name] = box
             change(self._boxes[scan.name], label=label)
 
-    def _offer_views(self, merge: MergeView | None) -> None:
+    def _offer_views(self, merge: Stored[Merge] | None) -> None:
         """Offer the 3D views: before and after the merge, merged, or side by side to pick points."""
         views = [BEFORE] if merge is None else [AFTER, BEFORE, *MERGED]
         if self._start.value == PICKED:
@@ -185,7 +187,7 @@ class Panel(StepPanel):
                 return
             names, start = self._list_chosen(), self._start.value
             versions = {
-                scan.name: (scan.points, scan.model, session.restriction(scan.name))
+                scan.name: (scan.figures.points, scan.figures.model, session.restriction(scan.name))
                 for scan in session.scans
                 if scan.cloud != "absent"
             }
@@ -214,7 +216,11 @@ class Panel(StepPanel):
         """Request the clouds of the chosen view."""
         merge, view, context = session.merge, self._view.value, self._context
         shown = self._list_shown(session, names, versions)
-        poses = {name: pair[2] for name, pair in merge.pairs.items()} if merge is not None and view == AFTER else {}
+        poses = (
+            {n: np.array(p.T_reference_scan) for n, p in merge.record.pairs.items()}
+            if merge is not None and view == AFTER
+            else {}
+        )
         key = (
             view,
             merge.name if merge else "",
@@ -225,14 +231,18 @@ class Panel(StepPanel):
         def make() -> ColouredClouds:
             """Load and colour the merged surface or the scans."""
             if merge is not None and view in MERGED:
-                return colour_merge(context.session, merge.name, view, [labels.get(name, name) for name in merge.scans])
+                return colour_merge(
+                    context.session, merge.name, view, [labels.get(name, name) for name in merge.record.scans]
+                )
             return colour_scans(context.session, shown, poses, labels)
 
         self._painter.request("clouds", key, make, self._draw_clouds)
 
     def _list_shown(self, session: SessionView, names: list[str], versions: Mapping[str, Any]) -> list[str]:
         """List the scans in the 3D view: those of the merge, else those to merge."""
-        return [name for name in (session.merge.scans if session.merge is not None else names) if name in versions]
+        return [
+            name for name in (session.merge.record.scans if session.merge is not None else names) if name in versions
+        ]
 
     def _redraw(self) -> None:
         """Draw the clouds again, as other points of them are hidden."""

@@ -35,6 +35,7 @@ from slviewer.gui.widgets import (
     thumbnail,
     to_html,
 )
+from slviewer.records.verification import Verification
 from slviewer.report.maps import error_limit
 from slviewer.simulation.concave import CONCAVE
 from slviewer.wizard.result_views import AlignedScans, ScanCloud, aligned_scans, used_points, whole_cloud
@@ -243,7 +244,7 @@ class Panel(StepPanel):
             if self._is_live:
                 return
             if session is not None and self._view.value == ALIGNED:
-                placed = tuple((each.name, each.model) for each in session.scans if is_placed(each))
+                placed = tuple((each.name, each.figures.model) for each in session.scans if is_placed(each))
                 self._painter.request(
                     "cloud", (ALIGNED, placed), lambda: aligned_scans(self._context.session), self._draw_aligned
                 )
@@ -251,9 +252,9 @@ class Panel(StepPanel):
             if scan.cloud == "absent":
                 self._clear_cloud()
                 return
-            views = session.verifications if session else ()
-            verified = tuple(mm for view in views if view.capture == scan.name for mm in view.rms_mm.values())
-            key = (scan.name, scan.model, scan.points, scan.noise_mm, verified)
+            views = session.list_records(Verification) if session else ()
+            verified = tuple(view.record.summary() for view in views if view.name == scan.name)
+            key = (scan.name, scan.figures.model, scan.figures.points, scan.figures.noise_mm, verified)
             colour = self._colour.value
 
             def make() -> tuple[ScanCloud, ScanCloud, str, str]:
@@ -441,18 +442,18 @@ def scan_html(scan: ScanView) -> Html:
     """Return a table of a scan's figures, with warnings."""
     if scan.cloud == "absent":
         return paragraph(coloured("Not reconstructed yet.", "warning"))
-    rows: list[tuple[object, object]] = [("Points", f"{scan.points:,}"), ("Model", scan.model)]
-    if scan.depth_mm is not None:
-        rows.append(("Depth range", f"{scan.depth_mm[0]:.0f} to {scan.depth_mm[1]:.0f} mm"))
-    if scan.noise_mm is not None:
-        rows.append(("Median noise of z", f"{scan.noise_mm:.3f} mm"))
-    if scan.masked is not None:
-        rows.append(("Masked (not calibrated)", f"{100 * scan.masked:.1f} % of pixels"))
+    rows: list[tuple[object, object]] = [("Points", f"{scan.figures.points:,}"), ("Model", scan.figures.model)]
+    if scan.figures.depth_mm is not None:
+        rows.append(("Depth range", f"{scan.figures.depth_mm[0]:.0f} to {scan.figures.depth_mm[1]:.0f} mm"))
+    if scan.figures.noise_mm is not None:
+        rows.append(("Median noise of z", f"{scan.figures.noise_mm:.3f} mm"))
+    if scan.figures.masked is not None:
+        rows.append(("Masked (not calibrated)", f"{100 * scan.figures.masked:.1f} % of pixels"))
     html = table((display_name(scan.name, scan.label), ""), rows)
-    if scan.masked is not None and scan.masked > MUCH_MASKED:
+    if scan.figures.masked is not None and scan.figures.masked > MUCH_MASKED:
         html += alert("Much is masked: capture target poses at the object's place.", "warning")
-    if scan.scale:
-        html += paragraph(f"{scan.scale[:1].upper()}{scan.scale[1:]}.")
+    if scan.figures.scale:
+        html += paragraph(f"{scan.figures.scale[:1].upper()}{scan.figures.scale[1:]}.")
     if scan.cloud == "stale":
         html += paragraph(coloured("Made with an older calibration: reconstruct it again.", "warning"))
     return Html(html)
@@ -470,7 +471,7 @@ def gallery(scans: Sequence[ScanView], chosen: str) -> Html:
     cards = []
     for scan in scans:
         frame = "var(--mantine-primary-color-filled)" if scan.name == chosen else "transparent"
-        state = _STATES[scan.cloud] or f"{scan.points:,} points"
+        state = _STATES[scan.cloud] or f"{scan.figures.points:,} points"
         tone: Tone = "dim" if scan.cloud == "fresh" else "warning"
         cards.append(
             f'<div style="width:92px;border:2px solid {frame};border-radius:6px;padding:2px;font-size:0.8rem;'

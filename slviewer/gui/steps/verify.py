@@ -1,9 +1,8 @@
 """Step 5: measure a plane or a sphere by each model, and compare with the noise floor of the capture."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
 import viser
 
 from slviewer.gui.inputs import Choice, change, display_name
@@ -11,12 +10,12 @@ from slviewer.gui.panel import PanelContext, StepPanel
 from slviewer.gui.pictures import PLOT_PX, Plot
 from slviewer.gui.preview import draw_preview, exposure_html, legend
 from slviewer.gui.simulated_object import SimulatedObject
-from slviewer.gui.widgets import Html, Picture, Text, colour_bar, coloured, colours, link, paragraph, table
-from slviewer.pipeline.verify import Shape
-from slviewer.report.data import SpacingRow, VerificationView
-from slviewer.report.maps import error_limit, error_maps
+from slviewer.gui.widgets import Picture, Text, colour_bar, colours, link, paragraph, records_html
+from slviewer.pipeline.stored_records import Stored
+from slviewer.records.verification import Shape, Verification
+from slviewer.report.maps import SIGN, error_limit, verification_maps
 from slviewer.report.page import Figure
-from slviewer.report.tables import models_of
+from slviewer.session.store import Session
 from slviewer.wizard import result_views
 from slviewer.wizard.snapshot import (
     PreviewView,
@@ -28,10 +27,9 @@ from slviewer.wizard.snapshot import (
 LAYER = "verify"
 SMALL_PX = 300
 """Width of the live image: it only shows whether the plane or the sphere is in view."""
-TABLE = "verifications.csv"
-MUCH_MASKED, MANY_OUTLIERS = 0.2, 0.02
-"""Shares of a shape or scan that are reported as a warning."""
-_SIGN = {"plane": "red is towards the camera", "sphere": "red is outwards"}
+TABLE = "figures.csv"
+MUCH_MASKED = 0.2
+"""Share of a scan that is reported as a warning."""
 
 
 class Panel(StepPanel):
@@ -99,16 +97,16 @@ class Panel(StepPanel):
                     change(folder, visible=False)
                 return
             self._draw_recorded(session)
-            rows = session.verifications
+            rows = session.list_records(Verification)
             for folder in (self._result_folder, self._table_folder):
                 change(folder, visible=bool(rows))
-            labels = {row.capture: row.name for row in rows}
+            labels = {row.name: row.label for row in rows}
             self._result.offer([(name, display_name(name, label)) for name, label in labels.items()])
             if new := [name for name in labels if name not in self._measured]:
                 if self._measured:  # show what was just measured
                     self._result.choose(new[-1])
                 self._measured = tuple(labels)
-            self._table.set(results_table(rows) + distances_table(session.distances))
+            self._table.set(records_html(rows))
             file = next((each for each in session.exports if each.name == TABLE), None)
             self._file.set("" if file is None else paragraph(link(self._context.offer(file.path), f"Download {TABLE}")))
             self._refresh()
@@ -146,21 +144,20 @@ class Panel(StepPanel):
         with self._lock:
             session = self._snapshot.session if self._snapshot else None
             name = self._result.value
-            view = next((each for each in session.verifications if each.capture == name), None) if session else None
+            found = session.list_records(Verification) if session else []
+            view = next((each for each in found if each.name == name), None)
             if view is None:
                 return
-            models = list(view.rms_mm)
+            models, shape = list(view.record.models), view.record.shape
             self._model.offer([(model, model) for model in models], models[-1])
-            self._figures.set(verification_html(view))
-            context, key = self._context, (name, tuple(view.rms_mm.items()))
-            self._painter.request(
-                "maps", key, lambda: _maps(result_views.error_maps(context.session, name), view), self._maps.set
-            )
+            self._figures.set(records_html([view]))
+            context, key = self._context, (name, view.record.summary())
+            self._painter.request("maps", key, lambda: _draw_maps(context.session, view), self._maps.set)
             model = self._model.value
             self._painter.request(
                 "cloud",
                 (key, model),
-                lambda: (result_views.whole_cloud(context.session, name), model, view.shape),
+                lambda: (result_views.whole_cloud(context.session, name), model, shape),
                 self._draw_cloud,
             )
 
@@ -170,7 +167,7 @@ class Panel(StepPanel):
         limit = error_limit(list(cloud.errors.values()))
         self._scene.cloud(LAYER, "cloud", cloud.points, colours(cloud.errors[model], -limit, limit, "error"))
         self._scene.show(LAYER, self._visible)
-        title = f"error of {model}; {_SIGN[shape]}; grey: not evaluated"
+        title = f"error of {model}; {SIGN[shape]}; grey: not evaluated"
         self._legend.set(colour_bar(f"−{limit:g} mm", f"+{limit:g} mm", "error", title))
         self._show_view()
 
@@ -198,7 +195,7 @@ class Panel(StepPanel):
 
 def _list_unverified(session: SessionView) -> list[ScanView]:
     """List the captures without an up-to-date verification."""
-    measured = {view.capture for view in session.verifications if not view.stale}
+    measured = {each.name for each in session.list_records(Verification) if not each.stale}
     return [scan for scan in session.scans if scan.name not in measured]
 
 
@@ -209,86 +206,7 @@ def shape_of(scan: ScanView) -> str:
     return next((shape for shape in ("plane", "sphere") if scan.name.lower().startswith(shape)), "scan")
 
 
-def verification_html(view: VerificationView) -> Html:
-    """Return a table of one capture's figures: each model's RMS beside the noise floor."""
-    sphere = view.shape == "sphere"
-    best = min(view.rms_mm, key=lambda model: view.rms_mm[model])
-    lines: list[list[object]] = []
-    for model, rms_mm in view.rms_mm.items():
-        outliers = view.set_aside[model] / max(view.points, 1)
-        lines.append(
-            [
-                model,
-                coloured(f"{rms_mm:.3f}", "good" if model == best else "plain", bold=model == best),
-                _format_value(view.noise_floor_mm[model]),
-                *([_format_value(view.radius_mm[model])] if sphere else []),
-                coloured(f"{100 * outliers:.1f}", "warning" if outliers > MANY_OUTLIERS else "plain"),
-                _format_value(100 * view.coverage[model], 1),
-            ]
-        )
-    titles = ["Model", "RMS, mm", "Noise floor, mm", *(["Radius, mm"] if sphere else []), "Outliers, %", "Coverage, %"]
-    html = table(titles, lines)
-    if view.incidence:
-        shares = ", ".join(f"{region} {share:.0f} %" for region, share in view.incidence.items())
-        html += paragraph(f"Depth ranges: {shares}")
-    for model, masked in view.masked.items():
-        if masked and masked > 0.0005:
-            text = f"{model}: {100 * masked:.1f} % masked, outside the calibrated region."
-            html += paragraph(coloured(text, "warning" if masked > MUCH_MASKED else "dim"))
-    if view.stale:
-        html += paragraph(coloured("Measured with an older calibration: measure it again.", "warning"))
-    return Html(html)
-
-
-def results_table(views: Sequence[VerificationView]) -> str:
-    """Return tables of planes, then spheres: a line per capture, a column per model, the best in bold."""
-    html = ""
-    for shape in ("plane", "sphere"):
-        of_shape = [view for view in views if view.shape == shape]
-        if not of_shape:
-            continue
-        models = models_of([view.rms_mm for view in of_shape])
-        lines: list[list[object]] = []
-        for view in of_shape:
-            least = min(view.rms_mm.values())
-            title = coloured(view.name + " (stale)" * view.stale, "warning" if view.stale else "plain")
-            rms = [view.rms_mm.get(model, np.nan) for model in models]
-            cells = [coloured(_format_value(mm), "good" if mm == least else "plain", bold=mm == least) for mm in rms]
-            shares = "/".join(f"{view.incidence.get(r, 0.0):.0f}" for r in ("R1", "R2", "R3"))
-            lines.append(
-                [
-                    title,
-                    shares if view.incidence else "–",
-                    *cells,
-                    _format_value(next(iter(view.noise_floor_mm.values()))),
-                ]
-            )
-        html += table([Html(f"{shape.capitalize()} RMS,&#160;mm"), "R1/R2/R3, %", *models, "Noise floor"], lines)
-        if shape == "sphere":
-            html += _table_by_model("Radius, mm", models, {view.name: view.radius_mm for view in of_shape})
-    return html
-
-
-def distances_table(distances: Sequence[SpacingRow]) -> str:
-    """Return a table of the distances of the spheres' centres by model; empty without any."""
-    measured = {each.name: each.measured_mm for each in distances}
-    return _table_by_model("Centre distance, mm", models_of(list(measured.values())), measured) if measured else ""
-
-
-def _table_by_model(title: str, models: Sequence[str], values: Mapping[str, Mapping[str, float]]) -> Html:
-    """Return a table with a line per name and a column per model."""
-    rows = [[name, *(_format_value(each.get(model, np.nan)) for model in models)] for name, each in values.items()]
-    return table([title, *models], rows)
-
-
-def _maps(maps: Mapping[str, np.ndarray], view: VerificationView) -> Figure:
-    """Plot the error maps of a capture by model."""
-    shown = {model: maps[model] for model in view.rms_mm if model in maps}
-    floor = list(view.noise_floor_mm.values())[-1]
-    title = display_name(view.capture, view.name)
-    return error_maps(title, shown, view.rms_mm, floor, width=PLOT_PX, sign=_SIGN[view.shape])
-
-
-def _format_value(value: float, digits: int = 3) -> str:
-    """Format a value with some digits; a dash where it is not finite."""
-    return f"{value:.{digits}f}" if np.isfinite(value) else "–"
+def _draw_maps(session: Session, view: Stored[Verification]) -> Figure:
+    """Draw the error maps of a capture by model."""
+    arrays = session.load_result(f"{Verification.kind}/{view.name}")[1]
+    return verification_maps(display_name(view.name, view.label), view.record, arrays, PLOT_PX)

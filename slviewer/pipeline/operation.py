@@ -1,0 +1,166 @@
+"""Operations: what computes records. One runner opens the session, runs one, stores what it finds, and returns that."""
+
+import inspect
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, fields, replace
+from functools import update_wrapper
+from pathlib import Path
+from typing import Any, Generic, ParamSpec, TypeVar
+
+import msgspec
+import numpy as np
+
+from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
+from slviewer.pipeline.open_session import SessionLike, opened_to_save
+from slviewer.pipeline.stored_records import save_record
+from slviewer.records.plain import to_plain
+from slviewer.records.record import Record
+from slviewer.records.table import render_text
+from slviewer.session.store import Session
+
+P = ParamSpec("P")
+R = TypeVar("R", bound=Record)
+S = TypeVar("S")
+
+
+@dataclass(frozen=True)
+class Job:
+    """One run of an operation: its session, and what takes its progress and warnings."""
+
+    store: Session
+    progress: Progress = ignore_progress
+    warn: Warn = ignore_warnings
+
+
+@dataclass(frozen=True, eq=False)
+class Found(Generic[R]):
+    """One record that an operation found, and its arrays. ``name``: the capture that it is of, or its number; empty
+    where ``stored`` is false, a name for the file alone. ``files``: what else was written, ``notes`` on it in words.
+    """
+
+    name: str
+    record: R
+    arrays: Mapping[str, np.ndarray] = field(default_factory=dict)
+    files: tuple[Path, ...] = ()
+    notes: tuple[str, ...] = ()
+    stored: bool = True
+
+
+class Findings(dict[str, R]):
+    """The records that an operation found, by name, the files that it wrote, and notes on these."""
+
+    def __init__(
+        self, kind: type[R], records: Mapping[str, R], files: tuple[Path, ...] = (), notes: tuple[str, ...] = ()
+    ) -> None:
+        super().__init__(records)
+        self.kind, self.files, self.notes = kind, files, notes
+
+    @property
+    def only(self) -> R:
+        """The record, where there is a single one. Raises ValueError otherwise."""
+        (record,) = self.values()
+        return record
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the records as they are stored: {kind: {name: record}}."""
+        return {self.kind.kind: dict(self)}
+
+    def summary(self) -> str:
+        """Return the records in one sentence."""
+        return "; ".join(
+            each.summary() if name.isdecimal() else f"{name}: {each.summary()}" for name, each in self.items()
+        )
+
+    def text(self) -> str:
+        """Return the records' tables and the notes for the terminal."""
+        tables = (f"{table.caption}\n{render_text(table)}" for table in self.kind.tables(self))
+        return "\n".join([*tables, *self.notes])
+
+
+def show_found(found: Found[R]) -> Findings[R]:
+    """Return one record as findings."""
+    return Findings(type(found.record), {found.name: found.record}, found.files, found.notes)
+
+
+class Operation(Generic[P, S, R]):
+    """A function that computes records, ``function(job, settings)``, which yields each as `Found`.
+
+    Called with a session and the fields of its settings, it runs and returns the records. The function's docstring
+    describes it, and that of the settings their fields: for Python, for the command's help, and for the pages.
+    """
+
+    def __init__(
+        self, name: str, function: Callable[[Job, S], Iterator[Found[Any]]], record: type[R], settings: Callable[P, S]
+    ) -> None:
+        update_wrapper(self, function)
+        self.name, self.function, self.record, self.settings = name, function, record, settings
+        parameters = inspect.signature(settings).parameters.values()
+        session = inspect.Parameter("session", inspect.Parameter.POSITIONAL_OR_KEYWORD, annotation=SessionLike)
+        self.__signature__ = inspect.Signature([session, *parameters], return_annotation=Findings[R])
+        self.__doc__ = f"{inspect.getdoc(function)}\n\n{inspect.getdoc(settings)}"
+
+    def __call__(self, session: SessionLike, *args: P.args, **kwargs: P.kwargs) -> Findings[R]:
+        """Run the operation on a session with these settings, and return what it found."""
+        return self.run(session, self.settings(*args, **kwargs))
+
+    def run(
+        self,
+        session: SessionLike,
+        settings: S,
+        progress: Progress = ignore_progress,
+        warn: Warn = ignore_warnings,
+    ) -> Findings[R]:
+        """Run the operation on a session; each record is stored, with its arrays, before the next is computed.
+
+        A session that another process writes to, or that is open for reading, is left as it is, with a warning for the
+        former.
+        """
+        records: dict[str, R] = {}
+        files, notes = list[Path](), list[str]()
+        with opened_to_save(session, warn) as store:
+            for found in self.find(Job(store, progress, warn), settings):
+                if isinstance(found.record, self.record):
+                    records[found.name] = found.record
+                files += found.files
+                notes += found.notes
+        return Findings(self.record, records, tuple(files), tuple(notes))
+
+    def find(self, job: Job, settings: S) -> Iterator[Found[Any]]:
+        """Yield everything that the operation finds, of any kind, once it is stored."""
+        for found in self.function(job, settings):
+            record = found.record
+            if not record.operation:
+                record = msgspec.structs.replace(record, operation=self.name, settings=plain_settings(settings))
+            if found.stored and job.store.is_writable:
+                save_record(job.store, found.name, record, found.arrays)
+            yield replace(found, record=record)
+
+
+def plain_settings(settings: Any) -> dict[str, Any]:
+    """Return the settings that are not the default as plain values, but those that its ``UNRECORDED`` names, which do
+    not influence what is found."""
+    left, chosen = (
+        getattr(settings, "UNRECORDED", ()),
+        {each.name: getattr(settings, each.name) for each in fields(settings)},
+    )
+    defaults = {each.name: each.default for each in fields(settings)}
+    return to_plain(  # type: ignore[no-any-return]
+        {name: value for name, value in chosen.items() if name not in left and value != defaults[name]}
+    )
+
+
+OPERATIONS: dict[str, Operation[Any, Any, Any]] = {}
+"""The operations by the name of their command."""
+
+
+def operation(
+    name: str, record: type[R], settings: Callable[P, S]
+) -> Callable[[Callable[[Job, S], Iterator[Found[Any]]]], Operation[P, S, R]]:
+    """Return a decorator that makes a function the operation of that name, which finds records with settings."""
+
+    def register(function: Callable[[Job, S], Iterator[Found[Any]]]) -> Operation[P, S, R]:
+        """Return the function's operation."""
+        OPERATIONS[name] = made = Operation(name, function, record, settings)
+        return made
+
+    return register

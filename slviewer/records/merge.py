@@ -1,0 +1,228 @@
+"""Scans of one object, registered and fused into one surface."""
+
+from collections import Counter
+from collections.abc import Mapping
+from math import acos, degrees, dist
+from typing import Any, ClassVar
+
+import msgspec
+
+from slviewer.records.record import Record
+from slviewer.records.table import Cell, Column, Table, Value
+from slviewer.records.verification import Count, Vector
+
+Row4 = tuple[float, float, float, float]
+Matrix4 = tuple[Row4, Row4, Row4, Row4]
+MIN_OVERLAP = 0.3
+"""Share of a scan below which its overlap with another is reported."""
+EXCLUDED = {
+    "edges": "at depth edges",
+    "grazing": "at grazing angles",
+    "groups": "in small groups",
+    "far": "far from everything else",
+    "unconfirmed": "contradicted by other scans",
+}
+"""Why points of scans are not part of the surface."""
+
+
+class Registered(msgspec.Struct, frozen=True, kw_only=True):
+    """The registration of one scan onto another: RMS along the normal, and from point to point; ``overlap``, 0 to 1;
+    one standard deviation of the pose at ``middle``, the centre of the overlap."""
+
+    scan: str = ""
+    onto: str = ""
+    rms_mm: float
+    overlap: float
+    T_reference_scan: Matrix4
+    point_to_point_rms_mm: float | None = None
+    agreement: float | None = None
+    slack_mm: float | None = None
+    gate_mm: float | None = None
+    start: str = ""
+    sigma_shift_mm: float | None = None
+    sigma_turn_deg: float | None = None
+    middle: Vector | None = None
+
+    @property
+    def turned_deg(self) -> float:
+        """The angle by which the scan was turned."""
+        trace = sum(self.T_reference_scan[k][k] for k in range(3))
+        return degrees(acos(max(-1.0, min(1.0, (trace - 1) / 2))))
+
+    @property
+    def moved_mm(self) -> float | None:
+        """How far the centre of the overlap was moved; None where an older merge lacks it."""
+        if self.middle is None:
+            return None
+        R, t = [row[:3] for row in self.T_reference_scan[:3]], [row[3] for row in self.T_reference_scan[:3]]
+        back = [x - s for x, s in zip(self.middle, t, strict=True)]
+        before = [sum(R[k][i] * back[k] for k in range(3)) for i in range(3)]
+        return dist(self.middle, before)
+
+
+class Loop(msgspec.Struct, frozen=True):
+    """The closure error of the pairs round these scans: as registered, and what the joint adjustment left."""
+
+    scans: list[str]
+    error_mm: float
+    error_deg: float
+    left_mm: float
+    left_deg: float
+
+
+class RefusedPair(msgspec.Struct, frozen=True):
+    """Two scans that were not registered, or whose registration others contradict, and why."""
+
+    scan: str
+    onto: str
+    why: str
+
+
+class MarkerPair(msgspec.Struct, frozen=True):
+    """Coded markers that two scans share, those that moved between them, and RMS distance of their corners."""
+
+    scan: str
+    onto: str
+    ids: list[int]
+    moved: list[int]
+    rms_mm: float
+
+
+class ContradictingPair(msgspec.Struct, frozen=True):
+    """Share of the compared points that lie more than ``gate_mm`` in front of the other scan's surface."""
+
+    scan: str
+    onto: str
+    share: float
+    compared: Count
+    gate_mm: float
+
+
+class Merge(Record, frozen=True, kw_only=True):
+    """Scans registered onto one of them, and fused into one surface, by the joint adjustment of all pairs.
+
+    ``pairs``: every scan but the reference on it; ``registered``: the pairs that the merge was made
+    from; ``loops`` that these close, the worst first; ``dropped``: pairs that the others
+    contradict. ``static_points`` stand still while the object moves; ``left_out``: {scan: {why:
+    points}}; ``shared``: share of the ``points`` seen by several scans. ``ply``: the file in the
+    session's exports; ``scale``, ``restrictions``: correction of scale, edits and region in words.
+    """
+
+    kind: ClassVar[str] = "merge"
+    title: ClassVar[str] = "Merges"
+    reference: str
+    scans: list[str]
+    pairs: dict[str, Registered]
+    points: Count = 0
+    ply: str = ""
+    model: str = ""
+    scale: str = ""
+    registered: list[Registered] = []
+    loops: list[Loop] = []
+    dropped: list[RefusedPair] = []
+    refused: list[RefusedPair] = []
+    markers: list[MarkerPair] = []
+    static_points: dict[str, Count] = {}
+    contradictions: list[ContradictingPair] = []
+    left_out: dict[str, dict[str, Count]] = {}
+    shared: float | None = None
+    restrictions: list[str] = []
+
+    @classmethod
+    def upgrade(cls, meta: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Add the registered pairs, which merges of version 0.1 lack: theirs are those on the reference."""
+        if "registered" in meta or not {"pairs", "reference"} <= meta.keys():
+            return meta
+        onto = [{**pair, "scan": scan, "onto": meta["reference"]} for scan, pair in meta["pairs"].items()]
+        return {**meta, "registered": onto}
+
+    @property
+    def excluded(self) -> Counter[str]:
+        """{why: points of all scans that are not part of the surface}."""
+        counts: Counter[str] = Counter()
+        for each in self.left_out.values():
+            counts.update(each)
+        return counts
+
+    def summary(self) -> str:
+        """Return RMS and overlap of each scan on the reference."""
+        pairs = (f"{n} RMS {p.rms_mm:.3f} mm, overlap {100 * p.overlap:.0f} %" for n, p in self.pairs.items())
+        return f"merged on {self.reference}: {'; '.join(pairs)}"
+
+    def figures(self) -> dict[str, float]:
+        """Return the RMS and overlap of each registered pair, and the number of points."""
+        pairs = {
+            f"{p.scan} on {p.onto} {key}": getattr(p, key) for p in self.registered for key in ("rms_mm", "overlap")
+        }
+        return {"points": float(self.points), **pairs}
+
+    @classmethod
+    def tables(cls, found: Mapping[str, "Merge"]) -> list[Table]:  # type: ignore[override]
+        """Return, for each merge, a table of its pairs and one of its loops, and notes of all that was excluded."""
+        return [table for name, each in found.items() for table in each._list_tables(name)]
+
+    def _list_tables(self, name: str) -> list[Table]:
+        columns = [
+            Column("scan", align="left"),
+            Column("onto", align="left"),
+            Column("RMS", "mm"),
+            Column("point to point", "mm", detail=True),
+            Column("overlap", "%", digits=0),
+            Column("sigma", "mm", digits=4),
+            Column("sigma", "°", digits=4, detail=True),
+            Column("moved", "mm", digits=2),
+            Column("turned", "°", digits=2, detail=True),
+            Column("common markers", detail=True),
+            Column("their corners", "mm", detail=True),
+        ]
+        marked = {(each.scan, each.onto): each for each in self.markers}
+        rows: list[list[Value | Cell]] = []
+        for pair in sorted(self.registered, key=lambda pair: self.reference not in (pair.scan, pair.onto)):
+            marks = marked.get((pair.scan, pair.onto))
+            rows.append(
+                [
+                    pair.scan,
+                    pair.onto,
+                    Cell(pair.rms_mm, "strong"),
+                    pair.point_to_point_rms_mm,
+                    Cell(100 * pair.overlap, "" if pair.overlap >= MIN_OVERLAP else "worse"),
+                    pair.sigma_shift_mm,
+                    pair.sigma_turn_deg,
+                    pair.moved_mm,
+                    pair.turned_deg,
+                    None if marks is None else len(marks.ids),
+                    None if marks is None else marks.rms_mm,
+                ]
+            )
+        tables = [Table(columns, rows, f"Merge {name}: registered pairs", self._list_notes()).without_empty()]
+        if self.loops:
+            ends = ("before", "after")
+            tables.append(
+                Table(
+                    [
+                        Column("loop", align="left"),
+                        *(Column(end, u, digits=d, detail=u == "°") for end in ends for u, d in (("mm", 3), ("°", 4))),
+                    ],
+                    [
+                        [" – ".join([*o.scans, o.scans[0]]), o.error_mm, o.error_deg, o.left_mm, o.left_deg]
+                        for o in self.loops
+                    ],
+                    f"Merge {name}: closure error of its loops, before and after the joint adjustment",
+                )
+            )
+        return tables
+
+    def _list_notes(self) -> list[str]:
+        shared = "" if self.shared is None else f", {100 * self.shared:.0f} % of them seen by several scans"
+        notes = [f"{self.points:,} points in the frame of {self.reference}{shared}."]
+        notes += [f"Excluded: {each.why}." for each in self.dropped]
+        notes += [f"Not registered: {each.scan} onto {each.onto}: {each.why}." for each in self.refused]
+        if counts := [f"{count:,} {EXCLUDED.get(why, why)}" for why, count in self.excluded.items() if count]:
+            notes.append(f"Excluded points: {', '.join(counts)}.")
+        if self.contradictions:
+            worst = max(self.contradictions, key=lambda each: each.share)
+            notes.append(
+                f"Contradicting points: {100 * worst.share:.2g} % at most of what both scans of a pair "
+                f"cover lie more than {worst.gate_mm:.2g} mm in front of the other's surface."
+            )
+        return [*notes, *(f"{each}." for each in (*self.restrictions, self.scale) if each)]

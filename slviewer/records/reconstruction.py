@@ -1,0 +1,90 @@
+"""The cloud of a capture, by one model."""
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+from slviewer.records.record import Record
+from slviewer.records.table import Cell, Column, Table, Value
+from slviewer.records.verification import Count
+
+REPORTED_RAISE = 1.2
+"""Times its predicted noise that a calibration's residual is, from which raising sigma is reported."""
+
+
+class Reconstruction(Record, frozen=True, kw_only=True):
+    """Captures as clouds, each by one model along one pattern axis, before edits and region.
+
+    Arrays, on the camera's grid: ``points`` (h, w, 3) float32 mm, ``sigma_z`` mm, ``phase`` rad, ``modulation`` (h, w)
+    float32, NaN where invalid; ``texture`` (h, w) or (h, w, 3) uint8; of some models ``sigma_calibration`` and
+    ``sigma_edges`` (h, w) float32 mm. ``depth_mm``: 1st and 99th percentile; ``noise_mm`` and ``sigma_calibration_mm``:
+    medians, of the depth's noise and of what the calibration leaves uncertain; ``raised``: the calibration's residuals
+    over their predicted noise, by which sigmas are raised; ``masked``: share of the pixels, 0 to 1, outside the
+    calibrated region, None for models that mask none; ``scale``: the correction of scale, in words; ``frame``: the one
+    that the points are in, in words.
+    """
+
+    kind: ClassVar[str] = "clouds"
+    title: ClassVar[str] = "Clouds"
+    model: str = ""
+    axis: str = "x"
+    points: Count = 0
+    depth_mm: tuple[float, float] | None = None
+    noise_mm: float | None = None
+    sigma_calibration_mm: float | None = None
+    raised: float = 1.0
+    masked: float | None = None
+    scale: str = ""
+    frame: str = ""
+
+    @classmethod
+    def upgrade(cls, meta: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Add the settings, which records of version 0.2 lack."""
+        captures = [name for name in meta.get("inputs", {}) if "/" not in name]
+        if "operation" in meta or not captures:
+            return meta
+        settings = {"capture": captures[0], "model": meta.get("model"), "axis": meta.get("axis")}
+        return {**meta, "operation": "reconstruct", "settings": settings}
+
+    def summary(self) -> str:
+        """Return how many points there are."""
+        return f"{self.points:,} points"
+
+    def figures(self) -> dict[str, float]:
+        """Return the number of points and the median noise of their depth."""
+        return {"points": float(self.points)} | ({} if self.noise_mm is None else {"noise_mm": self.noise_mm})
+
+    @classmethod
+    def tables(cls, found: Mapping[str, "Reconstruction"]) -> list[Table]:  # type: ignore[override]
+        """Return one table with a line for each cloud."""
+        columns = [
+            Column("capture", align="left"),
+            Column("model", align="left"),
+            Column("axis", align="centre"),
+            Column("points"),
+            Column("nearest", "mm", digits=0),
+            Column("farthest", "mm", digits=0),
+            Column("noise", "mm"),
+            Column("calibration", "mm", digits=4, detail=True),
+            Column("masked", "%", digits=1, detail=True),
+            Column("scale", align="left", detail=True),
+        ]
+        rows: list[list[Value | Cell]] = []
+        for name, each in found.items():
+            near, far = each.depth_mm or (None, None)
+            masked = None if each.masked is None else 100 * each.masked
+            figures = (each.points, near, far, each.noise_mm, each.sigma_calibration_mm, masked)
+            rows.append([name, each.model, each.axis, *figures, each.scale])
+        raised = [
+            f"{name}: sigma was raised: the calibration's residuals in {each.axis} are {each.raised:.1f} times their "
+            "predicted noise, and what disturbs its phases disturbs this capture's as well."
+            for name, each in found.items()
+            if each.raised > REPORTED_RAISE
+        ]
+        frames = {each.frame: None for each in found.values() if each.frame}
+        note = (
+            "Nearest and farthest: 1 % and 99 % of the depths. Noise and calibration: medians of the "
+            "standard deviations of depth, by the capture's noise and by what the calibration leaves "
+            "uncertain."
+        )
+        notes = [note, *raised, *(f"Frame: {frame}." for frame in frames)]
+        return [Table(columns, rows, cls.title, notes).without_empty()]

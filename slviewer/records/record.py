@@ -1,0 +1,80 @@
+"""The base of all records, their kinds, and figures by name."""
+
+import re
+from collections.abc import Iterator, Mapping
+from typing import Any, ClassVar, TypeVar
+
+import msgspec
+
+from slviewer.records.plain import to_plain
+from slviewer.records.table import Column, Table, Value
+
+RECORDS: dict[str, type["Record"]] = {}
+"""The kinds of records by the folder of their results."""
+UNITS = {
+    "mm": ("mm", 3), "mm2": ("mm²", 3), "mm3": ("mm³", 3), "um": ("µm", 1), "px": ("px", 3), "deg": ("°", 4),
+    "rad": ("rad", 4), "percent": ("%", 1), "ppm": ("ppm", 1), "s": ("s", 1), "ms": ("ms", 1),
+}  # fmt: skip
+"""{last word of a figure's name: (unit, decimals)}."""
+R = TypeVar("R", bound="Record")
+
+
+class Record(msgspec.Struct, frozen=True, kw_only=True):
+    """What an operation found: figures with their units in the names, and what they were made from.
+
+    ``operation`` and ``settings``, those that are not the default, made it from ``inputs``: {capture
+    or result: its hash}; ``scales``: {model: correction of scale in the figures}. A subclass names
+    its ``kind``, the folder of its results, and its ``title``; its docstring explains its figures in
+    the report. What older versions stored is converted by `upgrade`.
+    """
+
+    kind: ClassVar[str] = ""
+    title: ClassVar[str] = ""
+    operation: str = ""
+    settings: dict[str, Any] = {}
+    inputs: dict[str, str] = {}
+    scales: dict[str, float] = {}
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        RECORDS[cls.kind] = cls
+
+    @classmethod
+    def upgrade(cls, meta: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Return the entries of a stored record with today's names."""
+        return meta
+
+    @classmethod
+    def tables(cls, found: Mapping[str, "Record"]) -> list[Table]:
+        """Return the tables of some records of this kind, by the name of each: by default a line each, and a column for
+        every figure."""
+        figures = {name: {f: v for f, v in record.figures().items()} for name, record in found.items()}
+        names = list(dict.fromkeys(figure for each in figures.values() for figure in each))
+        rows: list[list[Value]] = [[name, *(each.get(f) for f in names)] for name, each in figures.items()]
+        return [Table([Column("name", align="left"), *map(figure_column, names)], rows, cls.title)]
+
+    def summary(self) -> str:
+        """Return the figures in one sentence."""
+        columns = {name: figure_column(name) for name in self.figures()}
+        return ", ".join(f"{c.title} {c.format(self.figures()[n])} {c.unit}".strip() for n, c in columns.items())
+
+    def figures(self) -> dict[str, float]:
+        """Return the numbers of the record by name; of those inside others ``name of the outer, of the inner``."""
+        plain = {key: value for key, value in to_plain(self).items() if key not in Record.__struct_fields__}
+        return dict(_list_numbers(plain, ""))
+
+
+def figure_column(name: str) -> Column:
+    """Return the column of a figure, with the unit that its name ends in."""
+    words = re.split(r"[ _]", name)
+    unit, digits = UNITS.get(words[-1], ("", 3))
+    return Column(" ".join(words[:-1] if unit else words), unit, digits=digits)
+
+
+def _list_numbers(value: Any, name: str) -> Iterator[tuple[str, float]]:
+    """List the numbers in plain values, with their names; texts, lists and truth values are none."""
+    if isinstance(value, Mapping):
+        for key, inner in value.items():
+            yield from _list_numbers(inner, f"{name} {key}".strip())
+    elif isinstance(value, int | float) and not isinstance(value, bool):
+        yield name, value

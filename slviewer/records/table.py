@@ -1,0 +1,146 @@
+"""Tables of figures with units: what the terminal, pages, panels and CSV files draw."""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from slviewer.errors import InputError
+
+Mark = Literal["", "better", "worse", "strong", "muted"]
+"""How a value compares with its rivals; colour and weight follow it, and the text beside it says so in words."""
+Value = str | int | float | None
+"""Of a cell; None and NaN are unknown."""
+UNKNOWN = "–"
+EQUAL = 0.02
+"""Two errors that differ by less than this share are called equal."""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A table cell whose value is marked."""
+
+    value: Value
+    mark: Mark = ""
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column's heading, its unit, the group of neighbours that it shares a heading with, and the decimals of its
+    numbers. ``detail``: left out where a table is narrow."""
+
+    title: str
+    unit: str = ""
+    group: str = ""
+    align: Literal["left", "right", "centre"] = "right"
+    digits: int = 3
+    detail: bool = False
+
+    @property
+    def heading(self) -> str:
+        """Group, title and unit in one line."""
+        return " ".join(filter(None, (self.group, self.title, self.unit)))
+
+    def format(self, value: Value) -> str:
+        """Return a value as text: numbers with the column's decimals, halves rounded up; a dash for unknown ones."""
+        if value is None or (isinstance(value, float) and not math.isfinite(value)):
+            return UNKNOWN
+        if isinstance(value, str):
+            return value
+        if isinstance(value, int):
+            return f"{value:,}"
+        return f"{value * (1 + 1e-9):.{self.digits}f}".replace("-", "−")
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows of values or cells under columns; ``footer`` rows (means) stand apart below, then ``notes``."""
+
+    columns: Sequence[Column]
+    rows: Sequence[Sequence[Value | Cell]]
+    caption: str
+    notes: Sequence[str] = ()
+    footer: Sequence[Sequence[Value | Cell]] = ()
+
+    def __post_init__(self) -> None:
+        for row in (*self.rows, *self.footer):
+            if len(row) != len(self.columns):
+                raise InputError(
+                    f"a row of the table '{self.caption}' has {len(row)} cells and the table {len(self.columns)} "
+                    "columns: give one cell a column"
+                )
+
+    @property
+    def groups(self) -> list[tuple[str, int]]:
+        """The headings above the columns' own, with how many columns each spans; empty where no column has one."""
+        spans: list[tuple[str, int]] = []
+        for column in self.columns:
+            if spans and spans[-1][0] == column.group:
+                spans[-1] = (column.group, spans[-1][1] + 1)
+            else:
+                spans.append((column.group, 1))
+        return spans if any(name for name, _ in spans) else []
+
+    def format(self, row: Sequence[Value | Cell]) -> Iterator[tuple[Column, str, Mark]]:
+        """Yield column, text and mark of each cell of a row."""
+        for column, cell in zip(self.columns, row, strict=True):
+            value, mark = (cell.value, cell.mark) if isinstance(cell, Cell) else (cell, "")
+            text = column.format(value)
+            yield column, text, "muted" if text == UNKNOWN else mark  # type: ignore[misc]
+
+    @staticmethod
+    def values(row: Sequence[Value | Cell]) -> list[Value]:
+        """Return the values of a row."""
+        return [cell.value if isinstance(cell, Cell) else cell for cell in row]
+
+    def select(self, keep: Sequence[Column]) -> "Table":
+        """Return the table with some of its columns alone."""
+        chosen = [index for index, column in enumerate(self.columns) if column in keep]
+        rows, footer = ([[row[k] for k in chosen] for row in part] for part in (self.rows, self.footer))
+        return Table([self.columns[k] for k in chosen], rows, self.caption, self.notes, footer)
+
+    def without_empty(self) -> "Table":
+        """Return the table without columns that hold nothing."""
+        rows = list(map(self.values, self.rows))
+        return self.select([c for k, c in enumerate(self.columns) if any(row[k] not in (None, "") for row in rows)])
+
+
+def better_worse(error: float | None, rival: float | None) -> Mark:
+    """Return the mark "better" or "worse" of an error against a rival's, by magnitude; none where they are equal."""
+    if error is None or rival is None or not (math.isfinite(error) and math.isfinite(rival)):
+        return ""
+    error, rival = abs(error), abs(rival)
+    if abs(error - rival) <= EQUAL * max(error, rival):
+        return ""
+    return "better" if error < rival else "worse"
+
+
+def compare_errors(error: float | None, rival: float | None) -> Cell:
+    """Return the cell that compares an error with a rival's, such as ``2.60 × better``, coloured."""
+    if not (error and rival and math.isfinite(error) and math.isfinite(rival)):
+        return Cell(None)
+    error, rival, mark = abs(error), abs(rival), better_worse(error, rival)
+    return Cell(f"{max(rival / error, error / rival):.2f} × {mark}" if mark else "equal", mark)
+
+
+def render_text(table: Table) -> str:
+    """Return a table for the terminal: names to the left, figures to the right, and its notes below.
+
+    Titles stand above their columns one word a line, so that wide tables stay narrow.
+    """
+    head = [column.heading.split() for column in table.columns]
+    height = max(map(len, head), default=0)
+    lines = [list(line) for line in zip(*([""] * (height - len(words)) + words for words in head), strict=True)]
+    body = [[text for _, text, _ in table.format(row)] for row in (*table.rows, *table.footer)]
+    widths = [max(map(len, cells)) for cells in zip(*lines, *body, strict=True)]
+
+    def align(line: Sequence[str]) -> str:
+        """Return the cells of a line side by side."""
+        cells = zip(table.columns, line, widths, strict=True)
+        return "  ".join(t.ljust(w) if c.align == "left" else t.rjust(w) for c, t, w in cells).rstrip()
+
+    rule = "-" * (sum(widths) + 2 * max(0, len(widths) - 1))
+    text = [*map(align, lines), rule, *map(align, body)]
+    if table.footer:
+        text.insert(-len(table.footer), rule)
+    return "\n".join([*text, *table.notes])

@@ -1,0 +1,178 @@
+"""How far captures of known shapes are from these shapes."""
+
+from collections.abc import Mapping
+from itertools import combinations
+from math import dist
+from typing import Annotated, Any, ClassVar, Literal
+
+import msgspec
+
+from slviewer.records.record import Record
+from slviewer.records.table import Cell, Column, Table, Value, compare_errors
+
+Shape = Literal["plane", "sphere"]
+Count = Annotated[int, msgspec.Meta(ge=0)]
+Vector = tuple[float, float, float]
+MAX_EXCLUDED = 0.02
+"""Share of points excluded above which the RMS does not describe the shape."""
+REPORTED_MASKED = 0.005
+"""Share of masked pixels from which on it is reported."""
+
+
+class ModelFit(msgspec.Struct, frozen=True):
+    """A shape fitted to the points of one model: ``excluded`` of the ``points`` lie beyond 5 robust sigma. Shares, 0 to
+    1: ``coverage`` of the illuminated pixels is measured, ``masked`` lie outside the calibrated region. A plane is
+    ``normal . X = offset_mm``, a sphere has a radius and a centre, in the camera's frame."""
+
+    points: Count
+    excluded: Count
+    rms_mm: float | None
+    noise_floor_mm: float | None = None
+    coverage: float | None = None
+    radius_mm: float | None = None
+    centre_mm: Vector | None = None
+    normal: Vector | None = None
+    offset_mm: float | None = None
+    masked: float | None = None
+
+
+class Verification(Record, frozen=True, kw_only=True):
+    """Known shapes, measured by each model over the pixels that all of them measure. Every RMS stands beside its noise
+    floor: what the capture's noise alone would give.
+
+    Arrays: ``error_<model>`` (h, w) float32 mm, NaN where nothing was evaluated; positive towards the camera for a
+    plane, outwards for a sphere. ``incidence``: percent of the shape in R1, R2 and R3. ``region_px``: first and last
+    column, first and last row; ``share`` of the measured pixels lie in it.
+    """
+
+    kind: ClassVar[str] = "verify"
+    title: ClassVar[str] = "Verification"
+    shape: Shape
+    models: Annotated[dict[str, ModelFit], msgspec.Meta(min_length=1)]
+    incidence: dict[str, float] | None = None
+    share: float | None = None
+    region_px: tuple[int, int, int, int] | None = None
+
+    @classmethod
+    def upgrade(cls, meta: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Convert a record of version 0.2, whose models' entries were spread over the record."""
+        if not {"centres_mm", "models", "shape"} <= meta.keys():
+            return meta
+        models = {name: dict(fit) for name, fit in meta["models"].items()}
+        for name, fit in models.items():
+            fit["excluded"] = fit.pop("set_aside")
+            for key, old in (("centre_mm", "centres_mm"), ("normal", "normals"), ("masked", "masked")):
+                fit[key] = meta.get(old, {}).get(name)
+        captures = [name for name in meta.get("inputs", {}) if "/" not in name]
+        settings = {"captures": captures, "shape": meta["shape"], "models": list(models)}
+        return {**meta, "models": models, "operation": cls.kind, "settings": settings}
+
+    @property
+    def best(self) -> str:
+        """The model with the smallest RMS."""
+        return min(self.models, key=lambda name: _or_infinite(self.models[name].rms_mm))
+
+    def summary(self) -> str:
+        """Return the RMS of each model in one sentence."""
+        return "RMS " + ", ".join(f"{name} {_or_infinite(fit.rms_mm):.3f} mm" for name, fit in self.models.items())
+
+    def figures(self) -> dict[str, float]:
+        """Return RMS, noise floor and radius of each model."""
+        return {
+            f"{name} {figure}": value
+            for name, fit in self.models.items()
+            for figure in ("rms_mm", "noise_floor_mm", "radius_mm")
+            if (value := getattr(fit, figure)) is not None
+        }
+
+    @classmethod
+    def tables(cls, found: Mapping[str, "Verification"]) -> list[Table]:  # type: ignore[override]
+        """Return a table of the planes, one of the spheres, and one of the distances between their centres."""
+        tables = []
+        for shape, caption in (
+            ("plane", "Planes: RMS distance from the best plane"),
+            ("sphere", "Spheres: RMS and radius"),
+        ):
+            if of_shape := {name: each for name, each in found.items() if each.shape == shape}:
+                tables.append(_make_table(of_shape, caption))
+        if distances := centre_distances_mm(found):
+            models = list(dict.fromkeys(model for each in distances.values() for model in each))
+            rows: list[list[Value]] = [[f"{a} to {b}", *map(each.get, models)] for (a, b), each in distances.items()]
+            columns = [Column("spheres", align="left"), *(Column(model, "mm") for model in models)]
+            tables.append(Table(columns, rows, "Distances between the centres of spheres"))
+        return tables
+
+
+def centre_distances_mm(found: Mapping[str, Verification]) -> dict[tuple[str, str], dict[str, float]]:
+    """Return {(name, name): {model: mm}}, the distances between the centres of each two spheres."""
+    centres = {
+        name: {model: fit.centre_mm for model, fit in each.models.items() if fit.centre_mm is not None}
+        for name, each in found.items()
+    }
+    return {
+        (a, b): {model: dist(centre, centres[b][model]) for model, centre in centres[a].items() if model in centres[b]}
+        for a, b in combinations([name for name, models in centres.items() if models], 2)
+    }
+
+
+def _make_table(found: Mapping[str, Verification], caption: str) -> Table:
+    """Return the table of measured planes or spheres: a line for each capture and model."""
+    first = next(iter(next(iter(found.values())).models))
+    columns = [
+        Column("capture", align="left"),
+        Column("model", align="left"),
+        Column("RMS", "mm"),
+        Column("noise floor", "mm"),
+        Column(f"against {first}", align="left", detail=True),
+        Column("radius", "mm"),
+        *(Column(depths, "%", "share in", digits=1, detail=True) for depths in ("R1", "R2", "R3")),
+        Column("points", detail=True),
+        Column("excluded", "%", digits=1),
+        Column("coverage", "%", digits=1),
+        Column("masked", "%", digits=1, detail=True),
+    ]
+    rows: list[list[Value | Cell]] = []
+    for name, each in found.items():
+        for model, fit in each.models.items():
+            compared = Cell("") if model == first else compare_errors(fit.rms_mm, each.models[first].rms_mm)
+            excluded = fit.excluded / max(1, fit.points)
+            rows.append(
+                [
+                    name,
+                    model,
+                    Cell(fit.rms_mm, "better" if model == each.best and len(each.models) > 1 else compared.mark),
+                    fit.noise_floor_mm,
+                    compared,
+                    fit.radius_mm,
+                    *((each.incidence or {}).get(depths) for depths in ("R1", "R2", "R3")),
+                    fit.points,
+                    Cell(100 * excluded, "worse" if excluded > MAX_EXCLUDED else ""),
+                    None if fit.coverage is None else 100 * fit.coverage,
+                    None if fit.masked is None else 100 * fit.masked,
+                ]
+            )
+    return Table(columns, rows, caption, _list_notes(found)).without_empty()
+
+
+def _list_notes(found: Mapping[str, Verification]) -> list[str]:
+    """Return what a reader of the table must know."""
+    notes = [
+        "Excluded: points beyond 5 robust sigma; above 2 % the RMS does not describe the shape. Coverage: measured "
+        "pixels of those illuminated and modulated."
+    ]
+    masked = [fit.masked for each in found.values() for fit in each.models.values()]
+    if any(share is not None and share > REPORTED_MASKED for share in masked):
+        notes.append("Masked: pixels that look through parts of camera or projector that no target pose illuminated.")
+    for name, each in found.items():
+        if each.region_px is not None:
+            left, right, top, bottom = each.region_px
+            share = "" if each.share is None else f", {100 * each.share:.0f} % of the measured pixels"
+            notes.append(f"{name}: columns {left}-{right}, rows {top}-{bottom}{share}; coverage is of this region.")
+    scaled = {model: factor for each in found.values() for model, factor in each.scales.items() if factor != 1}
+    notes += [f"{model}: scale corrected by {1e6 * (f - 1):+.0f} ppm.".replace("-", "−") for model, f in scaled.items()]
+    return notes
+
+
+def _or_infinite(value: float | None) -> float:
+    """Return the value, infinite where it is unknown."""
+    return float("inf") if value is None else value

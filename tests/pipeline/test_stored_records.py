@@ -1,0 +1,74 @@
+"""Records that version 0.2 stored are read as today's."""
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+from slviewer.errors import DamagedError
+from slviewer.pipeline.stored_records import load_record
+from slviewer.records.kinds import RECORDS
+from slviewer.records.merge import Merge
+from slviewer.records.reconstruction import Reconstruction
+from slviewer.records.verification import Verification, centre_distances_mm
+from slviewer.session.store import Session
+
+OLD = Path(__file__).parents[1] / "session" / "version_0_2"
+"""What version 0.2 stored of a simulated session at quarter resolution, without the arrays."""
+
+
+def as_stored(name: str) -> dict[str, object]:
+    meta: dict[str, object] = json.loads((OLD / name / "meta.json").read_text())
+    return meta
+
+
+@pytest.fixture
+def session(tmp_path: Path) -> Session:
+    with Session.create(tmp_path / "session") as store:
+        shutil.copytree(OLD, store.folder / "results", dirs_exist_ok=True)
+    return Session.open(tmp_path / "session")
+
+
+def test_verifications_keep_their_figures_and_can_be_repeated(session: Session) -> None:
+    old, found = as_stored("verify/sphere_1"), load_record(session, Verification, "sphere_1")
+    models = old["models"]
+    assert isinstance(models, dict) and isinstance(old["centres_mm"], dict)
+    for name, fit in found.models.items():
+        kept = (fit.points, fit.excluded, fit.rms_mm, fit.noise_floor_mm, fit.coverage, fit.radius_mm)
+        keys = ("points", "set_aside", "rms_mm", "noise_floor_mm", "coverage", "radius_mm")
+        assert kept == tuple(models[name][key] for key in keys)
+        assert fit.centre_mm == tuple(old["centres_mm"][name])
+    assert found.models["splined"].masked == old["masked"]["splined"]  # type: ignore[index]
+    assert found.incidence == old["incidence"] and found.inputs == old["inputs"] and found.scales == old["scales"]
+    assert found.settings == {"captures": ["sphere_1"], "shape": "sphere", "models": list(models)}
+    both = {name: load_record(session, Verification, name) for name in ("sphere_1", "sphere_2")}
+    assert centre_distances_mm(both)["sphere_1", "sphere_2"] == pytest.approx(
+        {"stereo": 24.809, "pixelwise": 24.818, "splined": 24.739}, abs=0.001
+    )
+
+
+def test_clouds_and_merges_keep_their_figures(session: Session) -> None:
+    old, cloud = as_stored("clouds/object_r1"), load_record(session, Reconstruction, "object_r1")
+    assert [cloud.points, cloud.model, cloud.noise_mm] == [old["points"], old["model"], old["noise_mm"]]
+    assert cloud.settings == {"capture": "object_r1", "model": "splined", "axis": "x"}
+    old, merge = as_stored("merge/1"), load_record(session, Merge, "1")
+    assert [merge.scans, merge.reference, merge.points] == [old["scans"], old["reference"], old["points"]]
+    assert len(merge.registered) == 3 and len(merge.loops) == 1 and merge.excluded["edges"] > 100
+    shown = [pair.moved_mm for pair in merge.registered]
+    assert all(moved is not None and 100 < moved < 400 for moved in shown)
+
+
+def test_every_record_has_figures_a_summary_and_tables(session: Session) -> None:
+    for result in session.result_names():
+        kind, _, name = result.partition("/")
+        record = load_record(session, RECORDS[kind], name)
+        (table, *_) = RECORDS[kind].tables({name: record})
+        assert record.summary() and record.figures() and table.rows and table.columns[0].title
+
+
+def test_a_record_of_other_types_is_damaged(session: Session) -> None:
+    path = session.folder / "results" / "verify" / "sphere_1" / "meta.json"
+    path.write_text(json.dumps({**as_stored("verify/sphere_1"), "models": {"stereo": {"points": -1}}}))
+    with pytest.raises(DamagedError):
+        load_record(session, Verification, "sphere_1")
