@@ -84,12 +84,13 @@ def alert(content: object, tone: Tone) -> Html:
     return paragraph(Html(f'<div style="{style}">{to_html(content)}</div>'))
 
 
-def table(titles: Sequence[object], rows: Sequence[Sequence[object]]) -> Html:
-    """Return a table: the first column left-aligned, the others right-aligned and without line breaks."""
+def table(titles: Sequence[object], rows: Sequence[Sequence[object]], aligned: Sequence[str] = ()) -> Html:
+    """Return a table: by default the first column left-aligned, the others right-aligned and without line breaks."""
 
     def line(tag: str, cells: Sequence[object], style: str) -> str:
         """Return one row of cells with this HTML tag and style."""
-        sides = ["left"] + [f"right{';white-space:nowrap' * (tag == 'td')}"] * (len(cells) - 1)
+        sides = aligned or ["left", *["right"] * (len(cells) - 1)]
+        sides = [f"{side}{';white-space:nowrap' * (tag == 'td' and side == 'right')}" for side in sides]
         return "".join(
             f'<{tag} style="text-align:{side};padding:0.2em 0 0.2em 0.6em;{style}">{to_html(c)}</{tag}>'
             for side, c in zip(sides, cells, strict=True)
@@ -108,16 +109,16 @@ def report_table(shown: Table) -> Html:
     """Return a table of figures without its details, with its notes."""
     tones: dict[Mark, Tone] = {"better": "good", "worse": "warning", "muted": "dim"}
     shown = shown.select([column for column in shown.columns if not column.detail])
-    titles = [shown.caption, *(c.title.capitalize() + (f", {c.unit}" if c.unit else "") for c in shown.columns[1:])]
+    titles = [f"{c.title[:1].upper()}{c.title[1:]}{c.unit and f', {c.unit}'}" for c in shown.columns]
     titles = [title.replace("-", NO_BREAK_HYPHEN) for title in titles]  # a line ends between words, in any font
     rows = [
-        [
-            coloured(text, tones.get(mark, "plain"), bold=mark in ("better", "strong"))
-            for _, text, mark in shown.format(row)
-        ]
-        for row in (*shown.rows, *shown.footer)
+        [coloured(text, tones.get(mark, "plain"), bold=mark in ("better", "strong")) for _, text, mark in line]
+        for line in shown.format([*shown.rows, *shown.footer])
     ]
-    return table(titles, rows) + "".join(paragraph(coloured(note, "dim")) for note in shown.notes)
+    caption = paragraph(coloured(shown.caption, "plain", bold=True)) if shown.caption else Html("")
+    aligned = [column.align for column in shown.columns]
+    notes = "".join(paragraph(coloured(note, "dim")) for note in shown.notes)
+    return caption + table(titles, rows, aligned) + notes
 
 
 def records_html(found: Sequence[Stored[Any]], labels: Mapping[str, str] = MappingProxyType({})) -> Html:
@@ -126,7 +127,10 @@ def records_html(found: Sequence[Stored[Any]], labels: Mapping[str, str] = Mappi
     if not found:
         return Html("")
     kind, shown = type(found[0].record), {each.label: each.record for each in found}
-    html = "".join(report_table(relabel(each, labels)) for each in kind.tables(shown))
+    tables = [relabel(each, labels) for each in kind.tables(shown)]
+    if len(found) == 1:  # whose name stands above
+        tables = [replace(each.without_constant(), caption="") for each in tables]
+    html = "".join(map(report_table, tables))
     if stale := ", ".join(each.label for each in found if each.stale):
         html += paragraph(coloured(f"Out of date, made from what has changed since: {stale}.", "warning"))
     return Html(html)

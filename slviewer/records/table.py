@@ -1,7 +1,7 @@
 """Tables of figures with units: what the terminal, pages, panels and CSV files draw."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -81,12 +81,18 @@ class Table:
                 spans.append((column.group, 1))
         return spans if any(name for name, _ in spans) else []
 
-    def format(self, row: Sequence[Value | Cell]) -> Iterator[tuple[Column, str, Mark]]:
-        """Yield column, text and mark of each cell of a row."""
-        for column, cell in zip(self.columns, row, strict=True):
-            value, mark = (cell.value, cell.mark) if isinstance(cell, Cell) else (cell, "")
-            text = column.format(value)
-            yield column, text, "muted" if text == UNKNOWN else mark  # type: ignore[misc]
+    def format(self, rows: Sequence[Sequence[Value | Cell]]) -> list[list[tuple[Column, str, Mark]]]:
+        """Return column, text and mark of each cell of some rows; a name that repeats the one above it is blank."""
+        lines: list[list[tuple[Column, str, Mark]]] = []
+        above = ""
+        for row in rows:
+            line = [(column, *_format_cell(column, cell)) for column, cell in zip(self.columns, row, strict=True)]
+            if line and line[0][0].align == "left":
+                name = line[0][1]
+                line[0] = (line[0][0], "" if name == above else name, line[0][2])
+                above = name
+            lines.append(line)
+        return lines
 
     @staticmethod
     def values(row: Sequence[Value | Cell]) -> list[Value]:
@@ -99,10 +105,22 @@ class Table:
         rows, footer = ([[row[k] for k in chosen] for row in part] for part in (self.rows, self.footer))
         return Table([self.columns[k] for k in chosen], rows, self.caption, self.notes, footer)
 
+    def without_constant(self) -> "Table":
+        """Return the table without a first column that holds one name alone, where it has several rows."""
+        names = {str(row[0]) for row in self.rows}
+        return self.select(self.columns[1:]) if len(names) == 1 < len(self.rows) else self
+
     def without_empty(self) -> "Table":
         """Return the table without columns that hold nothing."""
         rows = list(map(self.values, self.rows))
         return self.select([c for k, c in enumerate(self.columns) if any(row[k] not in (None, "") for row in rows)])
+
+
+def _format_cell(column: Column, cell: Value | Cell) -> tuple[str, Mark]:
+    """Return text and mark of a cell; what is unknown is muted."""
+    value, mark = (cell.value, cell.mark) if isinstance(cell, Cell) else (cell, "")
+    text = column.format(value)
+    return text, "muted" if text == UNKNOWN else mark  # type: ignore[return-value]
 
 
 def better_worse(error: float | None, rival: float | None) -> Mark:
@@ -131,7 +149,7 @@ def render_text(table: Table) -> str:
     head = [column.heading.split() for column in table.columns]
     height = max(map(len, head), default=0)
     lines = [list(line) for line in zip(*([""] * (height - len(words)) + words for words in head), strict=True)]
-    body = [[text for _, text, _ in table.format(row)] for row in (*table.rows, *table.footer)]
+    body = [[text for _, text, _ in line] for line in table.format([*table.rows, *table.footer])]
     widths = [max(map(len, cells)) for cells in zip(*lines, *body, strict=True)]
 
     def align(line: Sequence[str]) -> str:
