@@ -46,6 +46,7 @@ if TYPE_CHECKING:
     from slviewer.fringe.sequence import Frame, PatternSequence
     from slviewer.inspection.quantities import Quantity
     from slviewer.pipeline import datasets
+    from slviewer.pipeline.align import align
     from slviewer.pipeline.calibrate import CalibrationResult, calibrate, calibrate_frames, save_calibration
     from slviewer.pipeline.import_captures import import_captures, read_captures
     from slviewer.pipeline.measure import measure
@@ -85,6 +86,7 @@ _EXPORTS = {
     "Session": "session.store",
     "SlviewerError": "errors",
     "Verification": "records.verification",
+    "align": "pipeline.align",
     "align_clouds": "registration.multiway:register_all",
     "calibrate": "pipeline.calibrate",
     "calibrate_frames": "pipeline.calibrate",
@@ -123,10 +125,10 @@ _EXPORTS = {
 __all__ = [
     "Board", "CalibrationResult", "Cloud", "Frame", "Measurement", "PatternSequence", "PhaseMap", "Quantity",
     "Session", "SlviewerError", "Verification",
-    "align_clouds", "calibrate", "calibrate_frames", "check_description", "complementary", "datasets", "decode",
-    "detect_board", "draw_error_maps", "evaluate_plane", "evaluate_sphere", "fuse_clouds", "gray", "import_captures",
-    "load_arrays", "load_calibration", "measure", "merge", "mesh", "mesh_cloud", "micro", "multifrequency", "p18",
-    "plugins", "read_captures", "read_ply", "reconstruct", "reconstruct_cloud", "save_calibration", "texture", "verify",
+    "align", "align_clouds", "calibrate", "calibrate_frames", "check_description", "complementary", "datasets",
+    "decode", "detect_board", "draw_error_maps", "evaluate_plane", "evaluate_sphere", "fuse_clouds", "gray",
+    "import_captures", "load_arrays", "load_calibration", "measure", "merge", "mesh", "mesh_cloud",
+    "micro", "multifrequency", "p18", "plugins", "read_captures", "read_ply", "reconstruct", "reconstruct_cloud", "save_calibration", "texture", "verify",
     "write_ply",
 ]  # fmt: skip
 

@@ -4,10 +4,11 @@ Each scan that could be aligned has a result ``placement/NAME``, which says wher
 one that could not has the reason. A merge of all starts from there, and closes the loops.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import ClassVar
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
@@ -16,47 +17,28 @@ from slviewer.errors import InputError
 from slviewer.geometry.rigid import Floats, move_points
 from slviewer.pipeline.capture_clouds import capture_cloud, check_capture_sizes
 from slviewer.pipeline.capture_phases import decode_captures
-from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
+from slviewer.pipeline.feedback import Warn, ignore_warnings
 from slviewer.pipeline.models import check_accepted, load_model, preferred_model
-from slviewer.pipeline.open_session import SessionLike, opened
+from slviewer.pipeline.operation import Found, Job, operation
 from slviewer.pipeline.scan_edits import restrict_cloud
+from slviewer.pipeline.stored_records import load_record
 from slviewer.reconstruction.cloud import Cloud, choose_pixels
 from slviewer.reconstruction.reconstruct import normals
+from slviewer.records.merge import Matrix4
+from slviewer.records.placement import Placement
+from slviewer.records.plain import from_plain
 from slviewer.registration.refusal import Refused
 from slviewer.registration.static_scene import register_object
 from slviewer.session.scan_edits import load_region
 from slviewer.session.store import Session
 
-FOLDER = "placement"
+FOLDER = Placement.kind
 MOST_TRIED = 3
 """Scans that a new one is aligned to at most: the latest, then those before it."""
 _PIXELS = 130_000
 """Of a scan that is aligned: rows and columns of larger ones are skipped."""
 _SHOWN_POINTS = 25_000  # of a scan
 _REACH = 2.5  # spacings of the shown points
-
-
-@dataclass(frozen=True, eq=False)
-class Placement:
-    """Where a scan is: ``T_first_scan`` (4, 4) maps its points, mm, into the frame of the first aligned scan; None
-    where it could not be aligned, with the reason ``why``. ``onto``: the scan that it was aligned to, empty for the
-    first, with the ``rms_mm`` of the distances along the normal, and the share ``overlap`` of its points."""
-
-    scan: str
-    T_first_scan: Floats | None
-    onto: str = ""
-    rms_mm: float | None = None
-    overlap: float | None = None
-    why: str = ""
-
-    def text(self) -> str:
-        """The placement in one sentence."""
-        if self.T_first_scan is None:
-            return f"{self.scan} is kept apart: {self.why}"
-        if not self.onto:
-            return f"{self.scan} is the first scan: others are aligned to it"
-        assert self.rms_mm is not None and self.overlap is not None
-        return f"{self.scan} -> {self.onto}: RMS {self.rms_mm:.3f} mm, overlap {100 * self.overlap:.0f} %"
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,89 +58,79 @@ class AlignedScans:
         return float(np.mean(self.seen_by > 1)) if len(self.seen_by) else 0.0
 
 
-@dataclass(frozen=True, eq=False)
-class AlignReport:
-    """The placements of the scans that were aligned, and what they show together."""
-
-    placements: tuple[Placement, ...]
-    aligned: AlignedScans
-
-    def text(self) -> str:
-        """A line a scan, and what is seen more than once."""
-        lines = [placement.text() for placement in self.placements]
-        if len(self.aligned.names) > 1:
-            lines.append(
-                f"{len(self.aligned.names)} scans are in place; {100 * self.aligned.share_seen_again:.0f} % of the "
-                "surface is seen by more than one"
-            )
-        return "\n".join(lines)
-
-    def to_json(self) -> dict[str, Any]:
-        """The contract of ``align --json``."""
-        return {
-            "placements": {placement.scan: _to_meta(placement) for placement in self.placements},
-            "seen_again": self.aligned.share_seen_again,
-        }
-
-
-def align(
-    session: SessionLike,
-    captures: Sequence[str] = (),
-    *,
-    accept_rejected: bool = False,
-    progress: Progress = ignore_progress,
-    warn: Warn = ignore_warnings,
-) -> AlignReport:
-    """Align scans one after the other, each to those before it, as the wizard does while they are captured.
-
-    A scan that cannot be aligned is kept apart, with the reason. `merge` then starts from the places found.
+@dataclass(frozen=True)
+class AlignSettings:
+    """Which scans are aligned.
 
     Args:
-        session: Session folder.
         captures: Names of the captures, in the order in which they were captured; by default all scans that are not in
             place yet.
         accept_rejected: Use the calibration although its verdict rejects it.
 
-    Raises InputError where a capture does not belong to the calibration, and what `progress` raises.
+    ``only_reconstructed``: skip scans that were not reconstructed.
     """
-    with opened(session, write=True) as store:
-        check_accepted(store, accept_rejected)
-        names = list(captures) or [name for name in list_scans(store) if load_placement(store, name) is None]
-        placements, clouds = [], dict[str, Cloud]()
-        for i, name in enumerate(names):
-            progress(i / len(names), f"aligning {name}")
-            placements.append(align_scan(store, name, clouds=clouds, warn=warn))
-        report = AlignReport(tuple(placements), view_aligned(store, clouds))
-    progress(1.0, "aligned")
-    return report
+
+    UNRECORDED: ClassVar = ("only_reconstructed",)
+    captures: Sequence[str] = ()
+    accept_rejected: bool = False
+    only_reconstructed: bool = False
 
 
-def align_scan(
-    store: Session, name: str, *, clouds: dict[str, Cloud] | None = None, warn: Warn = ignore_warnings
-) -> Placement:
-    """Align one scan to those in place, and save its placement.
+@operation("align", Placement, AlignSettings)
+def align(job: Job, settings: AlignSettings) -> Iterator[Found[Placement]]:
+    """Align scans one after the other, each to those before it, as the wizard does while they are captured.
 
-    ``clouds``: those that were reconstructed before, by name, to which others are added.
+    A scan that cannot be aligned is kept apart, with the reason. `merge` then starts from the places found.
     """
-    clouds = {} if clouds is None else clouds
-    before = {other: T for other, T in load_places(store).items() if other != name}
-    placement = Placement(name, np.eye(4)) if not before else None
-    cloud = _load_cloud(store, name, clouds, warn)
-    refusals: list[str] = []
-    for onto in [*reversed(before)][:MOST_TRIED]:
-        pair = {onto: _load_cloud(store, onto, clouds, warn), name: cloud}
+    store = job.store
+    check_accepted(store, settings.accept_rejected)
+    names = list(settings.captures) or [name for name in list_scans(store) if load_placement(store, name) is None]
+    if settings.only_reconstructed:
+        names = [name for name in names if store.state_of(f"clouds/{name}") == "fresh"]
+    placed, clouds = load_placements(store), dict[str, Cloud]()
+    for i, name in enumerate(names):
+        job.progress(i / len(names), f"aligning {name}")
+        placed.pop(name, None)
+        found = _align_scan(job, name, placed, clouds)
+        if found.T_first_scan is not None:
+            placed[name] = found
+        if i == len(names) - 1 and len(placed) > 1:
+            found = msgspec.structs.replace(found, seen_again=view_places(placed, clouds, store).share_seen_again)
+        yield Found(name, found)
+    job.progress(1.0, "aligned")
+
+
+def _align_scan(job: Job, name: str, placed: Mapping[str, Placement], clouds: dict[str, Cloud]) -> Placement:
+    """Align one scan to those in place; clouds that are reconstructed are added to ``clouds``.
+
+    It is stale with the scan that it was aligned to, and with all that this was aligned by.
+    """
+    store, refusals = job.store, list[str]()
+    cloud = _load_cloud(store, name, clouds, job.warn)
+    inputs = store.input_hashes(name, *dict.fromkeys(("calibration/stereo", f"calibration/{cloud.model}")))
+    if not placed:
+        return Placement(T_first_scan=_to_rows(np.eye(4)), inputs=inputs)
+    for onto in [*reversed(list(placed))][:MOST_TRIED]:
+        pair = {onto: _load_cloud(store, onto, clouds, job.warn), name: cloud}
         try:
             registered = register_object(pair, onto).alignment.on_reference()[name]
         except (Refused, InputError) as error:
             refusals.append(str(error))
             continue
-        T = before[onto] @ registered.T_reference_scan
-        placement = Placement(name, T, onto, registered.rms_mm, registered.overlap)
-        break
-    placement = placement or Placement(name, None, why=refusals[0])
-    inputs = store.input_hashes(name, *dict.fromkeys(("calibration/stereo", f"calibration/{cloud.model}")))
-    store.save_result(f"{FOLDER}/{name}", {**_to_meta(placement), "inputs": inputs}, {})
-    return placement
+        T = _to_rows(np.array(placed[onto].T_first_scan) @ registered.T_reference_scan)
+        return Placement(
+            T_first_scan=T,
+            onto=onto,
+            rms_mm=registered.rms_mm,
+            overlap=registered.overlap,
+            inputs=placed[onto].inputs | inputs,
+        )
+    return Placement(why=refusals[0], inputs=inputs)
+
+
+def _to_rows(T: Floats) -> Matrix4:
+    """Return a transform as plain numbers."""
+    return from_plain(T.tolist(), Matrix4)  # type: ignore[arg-type]
 
 
 def remove_placement(store: Session, name: str) -> None:
@@ -175,35 +147,36 @@ def list_scans(store: Session) -> list[str]:
 
 def load_placement(store: Session, name: str) -> Placement | None:
     """The placement of a scan; None where it has none, or one that a newer calibration or capture has outdated."""
-    result = f"{FOLDER}/{name}"
-    if store.state_of(result) != "fresh":
-        return None
-    return read_placement(name, store.load_result(result, only=())[0])
+    fresh = store.state_of(f"{FOLDER}/{name}") == "fresh"
+    return load_record(store, Placement, name) if fresh else None
 
 
-def read_placement(name: str, meta: Mapping[str, Any]) -> Placement:
-    """The placement of a scan from the ``meta`` of its result."""
-    T = meta.get("T_first_scan")
-    figures = meta.get("onto", ""), meta.get("rms_mm"), meta.get("overlap"), meta.get("why", "")
-    return Placement(name, None if T is None else np.array(T, dtype=np.float64), *figures)
+def load_placements(store: Session) -> dict[str, Placement]:
+    """The placement of every scan that has its place, in the order in which they were captured."""
+    placements = {name: load_placement(store, name) for name in list_scans(store)}
+    return {name: each for name, each in placements.items() if each is not None and each.T_first_scan is not None}
 
 
 def load_places(store: Session) -> dict[str, Floats]:
     """T_first_scan (4, 4) of every scan in place, in the order in which they were captured."""
-    placements = (load_placement(store, name) for name in list_scans(store))
-    return {p.scan: p.T_first_scan for p in placements if p is not None and p.T_first_scan is not None}
+    return {name: np.array(each.T_first_scan) for name, each in load_placements(store).items()}
 
 
-def view_aligned(store: Session, clouds: dict[str, Cloud] | None = None) -> AlignedScans:
-    """The scans in place, thinned, with the number of scans that see each point. ``clouds`` as for `align_scan`."""
-    clouds = {} if clouds is None else clouds
+def view_aligned(store: Session) -> AlignedScans:
+    """The scans in place, thinned, with the number of scans that see each point."""
+    return view_places(load_placements(store), {}, store)
+
+
+def view_places(placed: Mapping[str, Placement], clouds: dict[str, Cloud], store: Session) -> AlignedScans:
+    """Scans in their places, thinned, with the number of scans that see each point; ``clouds``:
+    those that were loaded before."""
     thinned, facing = {}, [np.zeros(0)]
-    for name, T in load_places(store).items():
+    for name, each in placed.items():
         cloud = _load_cloud(store, name, clouds, ignore_warnings)
         points, directions = cloud.measured, choose_pixels(normals(cloud.points), cloud.mask)
         step = max(1, len(points) // _SHOWN_POINTS)
         points, directions = points[::step], directions[::step]
-        thinned[name] = move_points(T, points)
+        thinned[name] = move_points(np.array(each.T_first_scan), points)
         facing.append(-np.sum(points * directions, axis=1) / np.linalg.norm(points, axis=1))
     together, seen_by = count_views(thinned)
     return AlignedScans(tuple(thinned), together, seen_by, np.nan_to_num(np.concatenate(facing)).astype(np.float32))
@@ -249,15 +222,3 @@ def _load_cloud(store: Session, name: str, clouds: dict[str, Cloud], warn: Warn)
             sigma_edges=None,
         )
     return clouds[name]
-
-
-def _to_meta(placement: Placement) -> dict[str, Any]:
-    """Return a placement as plain values."""
-    T = placement.T_first_scan
-    return {
-        "T_first_scan": None if T is None else T.tolist(),
-        "onto": placement.onto,
-        "rms_mm": placement.rms_mm,
-        "overlap": placement.overlap,
-        "why": placement.why,
-    }

@@ -153,8 +153,8 @@ def collect_figures(store: Session) -> Figures:
             figures[f"calibration/{name}"] = _calibration_figures(store, name)
     for kind in RECORDS.values():
         for each in list_records(store, kind):
-            if not each.stale:
-                figures[f"{kind.kind}/{each.name}"] = each.record.figures()
+            if not each.stale and (of_record := each.record.figures()):
+                figures[f"{kind.kind}/{each.name}"] = of_record
     for measured in load_measurements(store):
         if not measured.stale:
             figures[f"measurements/{measured.id}"] = _measurement_figures(measured)

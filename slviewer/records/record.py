@@ -53,6 +53,11 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
         rows: list[list[Value]] = [[name, *(each.get(f) for f in names)] for name, each in figures.items()]
         return [Table([Column("name", align="left"), *map(figure_column, names)], rows, cls.title)]
 
+    @property
+    def is_good(self) -> bool:
+        """Whether what was found needs no attention."""
+        return True
+
     def summary(self) -> str:
         """Return the figures in one sentence."""
         columns = {name: figure_column(name) for name in self.figures()}

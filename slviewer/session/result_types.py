@@ -142,16 +142,6 @@ class _Edits(ResultMeta, total=False):
     content: str
 
 
-class _Placement(ResultMeta, total=False):
-    """`placement/*`."""
-
-    T_first_scan: _Matrix4 | None
-    onto: str
-    rms_mm: float | None
-    overlap: float | None
-    why: str
-
-
 class _MeasurementData(TypedDict, total=False):
     """The entries of a measurement's data that several readers use."""
 
@@ -225,7 +215,6 @@ _TYPES: dict[str, Any] = {
     "evidence": _Evidence,
     "trust": _FrameCheck,
     "edits": _Edits,
-    "placement": _Placement,
     "measurements": _Measurement,
     "inspection": _Inspection,
     "drift": _Drift,

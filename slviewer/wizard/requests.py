@@ -33,7 +33,9 @@ class RequestHandler:
 
         def done(result: T) -> None:
             """Add the description of the result to the notices, and mark the session as changed."""
-            self._engine.notices.add("good", describe(result))
+            is_good = not isinstance(result, Findings) or all(each.is_good for each in result.values())
+            if text := describe(result):
+                self._engine.notices.add("good" if is_good else "warning", text)
             self._engine.publisher.mark_changed(session=True)
 
         self._engine.jobs.submit(name, work, done, failed=failed)

@@ -6,7 +6,7 @@ from typing import Any
 
 from slviewer.errors import InputError
 from slviewer.pipeline.align import FOLDER as PLACEMENTS
-from slviewer.pipeline.align import Placement, remove_placement
+from slviewer.pipeline.align import AlignSettings, align, remove_placement
 from slviewer.pipeline.calibrate import CalibrationResult
 from slviewer.pipeline.export import What, check_export, formats
 from slviewer.pipeline.models import (
@@ -127,16 +127,8 @@ class ResultRequests(RequestHandler):
     @request("Aligning")
     def align(self, *names: str) -> None:
         """Align reconstructed scans to those in place; without names all that were not aligned yet."""
-        engine, store = self._engine, self._engine.store
-        chosen = [store.load_capture(name).name for name in names]
-
-        def done(placements: list[Placement]) -> None:
-            """Report where each scan is, or why it is kept apart, and mark the session as changed."""
-            for placement in placements:
-                engine.notices.add("warning" if placement.T_first_scan is None else "good", placement.text())
-            engine.publisher.mark_changed(session=True)
-
-        engine.jobs.submit("Aligning", partial(tasks.place_scans, store, chosen, warn=self._warner("merge")), done)
+        chosen = [self._engine.store.load_capture(name).name for name in names]
+        self._run("Aligning", align, AlignSettings(chosen, only_reconstructed=True), "merge")
 
     @request("Undoing the alignment")
     def undo_alignment(self, name: str) -> None:

@@ -1,7 +1,7 @@
 """Reads what a session's files contain, for the panels. Nothing is cached but what would be read again the same."""
 
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, TypeVar
@@ -15,7 +15,6 @@ from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import DamagedError, InputError
 from slviewer.fringe.presets import PRESETS
 from slviewer.inspection.parts import PartResult
-from slviewer.pipeline import align
 from slviewer.pipeline.calibration_verdict import load_last_verdict
 from slviewer.pipeline.capture import DEFAULT_PATTERNS
 from slviewer.pipeline.models import (
@@ -32,6 +31,7 @@ from slviewer.pipeline.models import (
 from slviewer.pipeline.scale import describe_scale, scale_factor
 from slviewer.pipeline.stored_records import Stored, captures_of, read_record
 from slviewer.records.kinds import RECORDS
+from slviewer.records.placement import Placement
 from slviewer.records.plain import from_plain
 from slviewer.records.reconstruction import Reconstruction
 from slviewer.session.capture import Capture
@@ -171,7 +171,7 @@ class SessionReader:
         inputs = _Inputs(captures, session.valid_decision("names") or {}, hashes, factors)
         poses, plan, pending = self._read_poses(captures, target, calibration, rig, focal_px)
         records = self._read_records(inputs)
-        clouds = {each.name: each for each in records if isinstance(each.record, Reconstruction)}
+        of_scan = {name: [each for each in records if each.name == name] for name in scans}
         verdict = self._attempt("the verdict", lambda: load_last_verdict(session), None)
         of_calibration = calibration is not None and _is_verdict_of(verdict, self._load_meta("calibration/stereo"))
         return SessionView(
@@ -186,7 +186,7 @@ class SessionReader:
             verdict=verdict,
             verdict_of_calibration=of_calibration,
             records=records,
-            scans=tuple(self._read_scan(captures[name], clouds.get(name), inputs) for name in scans),
+            scans=tuple(self._read_scan(captures[name], of_scan[name], inputs) for name in scans),
             measurements=self._attempt("the measurements", lambda: self._read_measurements(inputs), ()),
             deleted_measurements=sum(name.startswith(f"{MEASUREMENTS}/") for name in session.deleted_results()),
             nominals=list_nominals(session.folder),
@@ -380,9 +380,10 @@ class SessionReader:
         records = [self._attempt(name, partial(read, name), None) for name in names]
         return tuple(record for record in records if record is not None)
 
-    def _read_scan(self, capture: Capture, found: Stored[Reconstruction] | None, inputs: _Inputs) -> ScanView:
+    def _read_scan(self, capture: Capture, records: Sequence[Stored[Any]], inputs: _Inputs) -> ScanView:
         """Return the view of a scan capture: its label, and the figures and staleness of its cloud."""
-        read = partial(self._read_placement, capture.name, inputs)
+        found = next((each for each in records if isinstance(each.record, Reconstruction)), None)
+        place = next((each for each in records if isinstance(each.record, Placement)), None)
         edits, undone = self._attempt(
             f"the edits of {capture.name}", partial(list_edits, self.session, capture.name), (tuple[str, ...](), 0)
         )
@@ -394,16 +395,11 @@ class SessionReader:
             cloud="absent" if found is None else "stale" if found.stale else "fresh",
             figures=Reconstruction() if found is None else found.record,
             thumbnail=self._thumbnails.get(capture.hash, b""),
-            placement=self._attempt(f"the place of {capture.name}", read, None),
+            placement=place.record if place is not None and not place.stale else None,
             turn_step=capture.turn_step,
             edits=edits,
             undone_edits=undone,
         )
-
-    def _read_placement(self, name: str, inputs: _Inputs) -> align.Placement | None:
-        """Return where a scan is among the aligned ones; None where that is unknown or outdated."""
-        meta = self._find_meta(f"{align.FOLDER}/{name}")
-        return align.read_placement(name, meta) if meta and inputs.is_fresh(meta) else None
 
     def _read_measurements(self, inputs: _Inputs) -> tuple[Measurement, ...]:
         """Read all measurements, in the order they were made; stale as ``pipeline.measurements`` defines it."""

@@ -15,12 +15,12 @@ from slviewer.devices.browser import PageRole
 from slviewer.devices.world import Thing
 from slviewer.evaluation.crossvalidation import CrossValidation
 from slviewer.inspection.parts import PartResult
-from slviewer.pipeline.align import Placement
 from slviewer.pipeline.capture import Space
 from slviewer.pipeline.check_results import Preflight
 from slviewer.pipeline.stored_records import Stored
 from slviewer.pipeline.suggest_exposure import ExposureSuggestion
 from slviewer.records.merge import Merge
+from slviewer.records.placement import Placement
 from slviewer.records.reconstruction import Reconstruction
 from slviewer.records.record import Record
 from slviewer.registration.refusal import Reason

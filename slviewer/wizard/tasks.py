@@ -14,7 +14,6 @@ by a job of their own (`engine`), which no cloud waits for.
 
 from slviewer.errors import Cancelled, InputError, SlviewerError
 from slviewer.evaluation.crossvalidation import CrossValidation
-from slviewer.pipeline.align import Placement, align_scan, list_scans, load_placement
 from slviewer.pipeline.calibrate import CalibrationResult, calibrate
 from slviewer.pipeline.edit import SUPPORT, Selection, delete_points
 from slviewer.pipeline.feedback import Warn
@@ -23,7 +22,6 @@ from slviewer.pipeline.models import POSES_FOR_PIXELWISE, accepts_rejected, avai
 from slviewer.pipeline.operation import Findings
 from slviewer.pipeline.turn import WATERTIGHT, merge_turn
 from slviewer.pipeline.validate import validate
-from slviewer.reconstruction.cloud import Cloud
 from slviewer.records.merge import Merge
 from slviewer.session.scan_edits import load_edits
 from slviewer.session.store import Session
@@ -78,18 +76,6 @@ def describe_comparison(compared: CrossValidation) -> str:
     """Describe the comparison of the models in one sentence: held-out errors, and the recommended model."""
     figures = ", ".join(f"{model} {compared.rms(model, 'board_mm'):.3f} mm" for model in compared.models)
     return f"held-out error of the models: {figures}; {compared.recommended} is recommended"
-
-
-def place_scans(session: Session, names: list[str], report: Reporter, warn: Warn) -> list[Placement]:
-    """Align scans to those in place; by default all that are reconstructed and were not aligned yet."""
-    chosen = names or [name for name in list_scans(session) if load_placement(session, name) is None]
-    fresh = [name for name in chosen if session.state_of(f"clouds/{name}") == "fresh"]  # or reconstructing failed
-    placements, guarded, clouds = [], session.guarded(report.saving), dict[str, Cloud]()
-    for i, name in enumerate(fresh):
-        report(i / len(fresh), f"aligning {name}")
-        placements.append(align_scan(guarded, name, clouds=clouds, warn=warn))
-    report(1.0, "aligned")
-    return placements
 
 
 def remove_support(session: Session, names: list[str], report: Reporter, warn: Warn) -> dict[str, int]:

@@ -178,13 +178,13 @@ def test_scans_are_aligned_as_they_come_and_merged_from_there(operator: Operator
     assert snapshot.session is not None and snapshot.session.aligns_scans
     placed = {scan.name: scan.placement for scan in snapshot.session.scans if scan.placement is not None}
     assert set(placed) == set(chosen)
-    assert missing_facts(placed["first"].text(), "first") == []
+    assert missing_facts(placed["first"].summary(), "first") == []
     assert placed["ball_0"].T_first_scan is None
-    assert missing_facts(placed["ball_0"].text(), "ball_0", placed["ball_0"].why) == []
+    assert missing_facts(placed["ball_0"].summary(), placed["ball_0"].why) == []
     for name in ("second", "third"):
         T = placed[name].T_first_scan
         assert T is not None and 0.003 < (placed[name].rms_mm or 0) < 0.3
-        D = T @ np.linalg.inv(truth(name))
+        D = np.array(T) @ np.linalg.inv(truth(name))
         assert 1e-5 < np.linalg.norm(D[:3, :3] @ MIDDLE + D[:3, 3] - MIDDLE) < 0.3
     together = result_views.aligned_scans(store)
     assert together.names == ("first", "second", "third") and 0.6 < together.share_seen_again < 1

@@ -293,7 +293,9 @@ class Panel(StepPanel):
         change(self._place, visible=scan.cloud == "fresh" and not is_placed(scan), disabled=is_busy)
         change(self._take_out, visible=is_placed(scan), disabled=is_busy)
         tone: Tone = "good" if is_placed(scan) else "warning"
-        self._placement.set("" if placement is None else paragraph(coloured(placement.text(), tone)))
+        self._placement.set(
+            "" if placement is None else paragraph(coloured(f"{scan.label}: {placement.summary()}", tone))
+        )
 
     def _draw_aligned(self, aligned: AlignedScans) -> None:
         """Draw the scans in place, in the colours of how many see each point."""
