@@ -91,7 +91,7 @@ class BoardPlane:
         height, width = coordinate.shape
         expected = self.predict(np.arange(width)[None] + origin[0], np.arange(height)[:, None] + origin[1])
         with np.errstate(invalid="ignore"):
-            return np.asarray(np.abs(coordinate - expected[..., along]) < self.reach[along])
+            return np.abs(coordinate - expected[..., along]) < self.reach[along]
 
 
 def _undistort_division(normalised: np.ndarray, bend: float) -> np.ndarray:

@@ -1,18 +1,16 @@
 """The projector coordinate at a board feature, and its slopes there, read from the phase around it."""
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slviewer.geometry.jit import kernel, run_rows
+from slviewer.geometry.rigid import Floats
 
 MAX_OFF_CENTRE = 0.35
 """Largest distance, in half widths, between the centroid of a window's samples and its centre; beyond it, the fit would
 extrapolate. At a chessboard's corner two opposite squares are bright, and their centroid is the corner."""
 
 
-def fit_local_values(
-    field: np.ndarray, weight: np.ndarray, pixels: NDArray[np.float64], radius: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def fit_local_values(field: np.ndarray, weight: np.ndarray, pixels: Floats, radius: Floats) -> tuple[Floats, Floats]:
     """Fit value and slopes of ``field`` (h, w) at sub-pixel ``pixels`` (n, 2), by a robust quadratic around each.
 
     ``radius`` (n,) px: half the width of each window; ``weight`` (h, w): 0 where the field is not used, so that the

@@ -221,7 +221,7 @@ def _list_candidates(
     farthest = visible.argmax(axis=-1)
     far_enough = (shares[farthest] > 0.15) | (places == 0).all(axis=1)
     chosen = np.take_along_axis(T, farthest[..., None, None, None], axis=3)[..., 0, :, :]
-    return np.asarray(chosen[visible.any(axis=-1) & far_enough])
+    return chosen[visible.any(axis=-1) & far_enough]
 
 
 def _is_visible(

@@ -19,6 +19,7 @@ from slviewer.errors import DetectionError, InputError
 from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.polynomial import Polynomial2D, fit_polynomial
+from slviewer.geometry.rigid import Floats
 from slviewer.geometry.splines import SplineSurface, fit_spline
 from slviewer.target.board import Board
 from slviewer.target.detect import Detection, board_mask
@@ -48,9 +49,9 @@ class Samples:
     (n, 2) px: their standard deviations predicted from the capture's noise. An axis that was not captured is NaN.
     """
 
-    camera: NDArray[np.float64]
-    projector: NDArray[np.float64]
-    sigma: NDArray[np.float64]
+    camera: Floats
+    projector: Floats
+    sigma: Floats
 
     def __post_init__(self) -> None:
         shapes = {a.shape for a in (self.camera, self.projector, self.sigma)}
@@ -120,8 +121,8 @@ class Observation:
     """
 
     name: str
-    points: NDArray[np.float64]
-    camera: NDArray[np.float64]
+    points: Floats
+    camera: Floats
     projector: np.ndarray
     surfaces: Mapping[Axis, SplineSurface | Polynomial2D]
     periods_px: Mapping[Axis, float]
@@ -140,7 +141,7 @@ class Observation:
         shape = (v1 - v0, u1 - u0)
         return np.unpackbits(self.packed_region, count=shape[0] * shape[1]).view(bool).reshape(shape)
 
-    def smoothed_phase(self, axis: Axis) -> NDArray[np.float64]:
+    def smoothed_phase(self, axis: Axis) -> Floats:
         """(v1 - v0, u1 - u0) float64 rad over ``box``: the smoothed absolute phase, NaN outside the region."""
         u0, v0, u1, v1 = self.box
         return np.where(self.region, self.surfaces[axis].evaluate_grid((v1 - v0, u1 - u0), (u0, v0)), np.nan)
@@ -261,7 +262,7 @@ def observe(
     )
 
 
-def pitch_px(board: Board, detection: Detection) -> NDArray[np.float64]:
+def pitch_px(board: Board, detection: Detection) -> Floats:
     """Return the board's pitch (n,) in camera px at each feature."""
     points = board.points[detection.ids][:, :2]
     H, _ = cv2.findHomography(points, np.asarray(detection.pixels, float))
@@ -293,7 +294,7 @@ def _projector_pixels(
 def _phase_weight(phase: PhaseMap, bright: np.ndarray) -> np.ndarray:
     """Return weights (h, w): the inverse variance of the phase of bright pixels over its maximum, else 0."""
     weight = np.where(bright, 1.0 / np.maximum(phase.sigma_phase, 1e-6) ** 2, 0.0)
-    return np.asarray(weight / max(float(weight.max()), 1e-30))
+    return weight / max(float(weight.max()), 1e-30)
 
 
 def smooth_axes(

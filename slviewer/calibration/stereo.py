@@ -78,9 +78,7 @@ class StereoModel:
         magnification = self.rig.projector.K[1, 1] / self.rig.camera.K[1, 1]
         return float(np.hypot(rms["projector"], magnification * rms["camera"]) / np.sqrt(2))  # of one coordinate
 
-    def undistort_pairs(
-        self, camera_pixels: NDArray[np.float64], projector_pixels: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def undistort_pairs(self, camera_pixels: Floats, projector_pixels: Floats) -> tuple[Floats, Floats]:
         """Return the undistorted normalised coordinates (n, 2) of camera pixels (n, 2) and of projector pixels (n, 2).
 
         NaN where the inversion of the distortion fails.

@@ -85,7 +85,7 @@ def within_sigmas(residuals: np.ndarray, points: np.ndarray) -> np.ndarray:
     exact points it is nothing but rounding, which excludes none of them.
     """
     reach = max(SET_ASIDE_SIGMA * robust_sigma(residuals), 1e-9 * float(np.abs(points).max()))
-    return np.asarray(np.abs(residuals - np.median(residuals)) <= reach)
+    return np.abs(residuals - np.median(residuals)) <= reach
 
 
 def measure(

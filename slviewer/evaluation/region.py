@@ -110,7 +110,7 @@ def measured_pixels(points: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
         raise InputError(f"The cloud has shape {points.shape}: an organised cloud (h, w, 3) is needed.")
     if mask is not None and mask.shape != points.shape[:2]:
         raise InputError(f"The mask has shape {mask.shape} and the cloud {points.shape[:2]}: they must agree.")
-    measured: np.ndarray = np.isfinite(points).all(axis=2)
+    measured = np.isfinite(points).all(axis=2)
     measured = measured if mask is None else measured & mask
     if np.count_nonzero(measured) < LEAST_PIXELS:
         raise InputError(
@@ -167,8 +167,7 @@ def _largest_patch(agreeing: np.ndarray) -> np.ndarray:
     inside = (stats[:, 0] > 0) & (stats[:, 1] > 0) & (stats[:, 0] + stats[:, 2] < w) & (stats[:, 1] + stats[:, 3] < h)
     holes = small & inside
     holes[0] = False  # label 0 is the patch itself
-    filled: np.ndarray = patch | holes[labels]
-    return filled
+    return patch | holes[labels]
 
 
 def _remove_rim(patch: np.ndarray) -> np.ndarray:

@@ -227,8 +227,7 @@ class _Optics:
         of_camera = camera.focal_px * camera.aperture_mm / 4 * (1 / z - 1 / self.focus)
         columns_per_px = (z / camera.focal_px) / (depths / projector.focal_px[0])
         camera_sigma = np.sqrt(camera.blur_px**2 + of_camera**2 + 1 / 12) * columns_per_px
-        blur: np.ndarray = np.sqrt(projector.blur_px**2 + of_projector**2 + 1 / 12 + camera_sigma**2)
-        return blur
+        return np.sqrt(projector.blur_px**2 + of_projector**2 + 1 / 12 + camera_sigma**2)
 
     def light_on(self, z: float, is_lit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the projector's light (h, w) that returns from a white plane at depth z, and the room's, as shares of

@@ -34,7 +34,7 @@ class Polynomial2D:
         height, width = shape
         s, t = _normalise_pixels(origin[0] + np.arange(width), origin[1] + np.arange(height), self.box)
         degree = len(self.coefficients) - 1
-        out: np.ndarray = chebyshev.chebvander(t, degree) @ self.coefficients @ chebyshev.chebvander(s, degree).T
+        out = chebyshev.chebvander(t, degree) @ self.coefficients @ chebyshev.chebvander(s, degree).T
         out[np.abs(t) > 1.0], out[:, np.abs(s) > 1.0] = np.nan, np.nan
         return out
 
@@ -85,7 +85,7 @@ def monomials(points: np.ndarray, degree: int) -> np.ndarray:
 def scale_to_unit_square(points: np.ndarray) -> np.ndarray:
     """Scale points (n, 2) so that their extent along x and along y is -1 to 1."""
     low = points.min(0)
-    return np.asarray(2 * (points - low) / np.maximum(np.ptp(points, axis=0), 1e-9) - 1)
+    return 2 * (points - low) / np.maximum(np.ptp(points, axis=0), 1e-9) - 1
 
 
 def parse_box(extent: Sequence[float]) -> Box:

@@ -32,8 +32,7 @@ def ransac_plane(points: np.ndarray, tolerance: float, seed: int = 0) -> tuple[P
 
     def distances(sample: np.ndarray, normal: np.ndarray, offset: np.ndarray) -> np.ndarray:
         """Return the signed distances (k, n) mm of the sample (n, 3) from each plane."""
-        result: np.ndarray = normal @ sample.T - offset[:, None]
-        return result
+        return normal @ sample.T - offset[:, None]
 
     return _search(points, 3, tolerance, seed, hypotheses, distances, fit_plane, "plane")
 
@@ -66,8 +65,7 @@ def ransac_sphere(
         middle = sample.mean(axis=0)  # centred: the difference of squares loses no digits
         x, c = sample - middle, centre - middle
         squares = np.einsum("ij,ij->i", x, x) + np.einsum("ij,ij->i", c, c)[:, None] - 2.0 * c @ x.T
-        result: np.ndarray = np.sqrt(np.maximum(squares, 0.0)) - radii[:, None]
-        return result
+        return np.sqrt(np.maximum(squares, 0.0)) - radii[:, None]
 
     def fit(chosen: np.ndarray) -> Sphere:
         """Fit a sphere to the inliers (n, 3); InputError where its radius is outside the allowed range."""
@@ -154,5 +152,4 @@ def _minimal_sets(sample: np.ndarray, size: int, rng: np.random.Generator) -> np
 
 def _score(residuals: np.ndarray, tolerance: float) -> np.ndarray:
     """Sum of squares truncated at the tolerance, along the last axis: fewer and larger residuals cost more."""
-    total: np.ndarray = np.minimum((residuals / tolerance) ** 2, 1.0).sum(axis=-1)
-    return total
+    return np.minimum((residuals / tolerance) ** 2, 1.0).sum(axis=-1)

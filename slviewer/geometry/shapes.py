@@ -20,8 +20,7 @@ class Plane:
 
     def distance(self, points: np.ndarray) -> np.ndarray:
         """Signed distances (...) mm of points (..., 3), positive on the camera's side."""
-        distances: np.ndarray = np.asarray(points, dtype=np.float64) @ self.normal - self.offset
-        return distances
+        return np.asarray(points, dtype=np.float64) @ self.normal - self.offset
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,8 +96,7 @@ def _select_finite(points: np.ndarray, least: int, what: str) -> tuple[np.ndarra
 
 def _norms(vectors: np.ndarray) -> np.ndarray:
     """Lengths (...) of vectors (..., 3): `numpy.linalg.norm` along a short axis takes several times as long."""
-    lengths: np.ndarray = np.sqrt(np.einsum("...i,...i->...", vectors, vectors))
-    return lengths
+    return np.sqrt(np.einsum("...i,...i->...", vectors, vectors))
 
 
 def _algebraic_sphere(points: np.ndarray) -> tuple[np.ndarray, float]:

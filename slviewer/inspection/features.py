@@ -32,7 +32,7 @@ class Feature:
         outwards."""
         offsets = np.asarray(points, np.float64) - self.place
         if self.kind == "plane":
-            return np.asarray(offsets @ self._direction)
+            return offsets @ self._direction
         return np.linalg.norm(self._across(offsets), axis=-1) - (self.radius or 0.0)
 
     def normals(self, points: np.ndarray) -> np.ndarray:
@@ -41,7 +41,7 @@ class Feature:
         if self.kind == "plane":
             return np.broadcast_to(self._direction, offsets.shape)
         across = self._across(offsets)
-        return np.asarray(across / np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-300))
+        return across / np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-300)
 
     def jacobian(self, points: np.ndarray) -> np.ndarray:
         """Return the derivatives (n, p) of ``distance`` of the points (n, 3) by the parameters."""
@@ -87,7 +87,7 @@ class Feature:
         """Return the offsets (n, 3) from the feature's place, for a cylinder only their part across the axis."""
         if self.kind != "cylinder":
             return offsets
-        return np.asarray(offsets - (offsets @ self._direction)[..., None] * self._direction)
+        return offsets - (offsets @ self._direction)[..., None] * self._direction
 
     def _tangents(self) -> np.ndarray:
         """Return two unit vectors (2, 3) perpendicular to the direction and to each other."""

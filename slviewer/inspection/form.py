@@ -77,7 +77,7 @@ class SmoothDeviations:
     @property
     def smooth(self) -> np.ndarray:
         """(n,) mm: the smooth part, the mean of its draws."""
-        return np.asarray(self.basis @ self.draws.mean(axis=1))
+        return self.basis @ self.draws.mean(axis=1)
 
 
 def smooth_deviations(
@@ -234,7 +234,7 @@ def orientation_error(
         if along:
             return datum_direction * np.sign(datum_direction @ f.direction)
         across = f.direction - (f.direction @ datum_direction) * datum_direction
-        return np.asarray(across / np.linalg.norm(across))
+        return across / np.linalg.norm(across)
 
     normal = zone_normal(d.direction)
     normals = np.broadcast_to(normal, points.shape)
@@ -246,7 +246,7 @@ def orientation_error(
 
     def displaced(places: np.ndarray) -> np.ndarray:
         """Changes of the heights (n, draws) by the draws of the datum."""
-        return np.asarray((places - f.place) @ turned.T)
+        return (places - f.place) @ turned.T
 
     return zone_width(kind, smooth, lambda heights: np.ptp(heights, axis=0), shared, displaced)
 
@@ -405,7 +405,7 @@ def _span(columns: np.ndarray, without: np.ndarray | None = None) -> np.ndarray:
         for _ in range(2):  # once more, for what rounding left
             columns = columns - without @ (without.T @ columns)
     vectors, values, _ = np.linalg.svd(columns, full_matrices=False)
-    return np.asarray(vectors[:, values > SPAN_RATIO])
+    return vectors[:, values > SPAN_RATIO]
 
 
 def _even_weights(unrolled: np.ndarray) -> np.ndarray:
@@ -417,7 +417,7 @@ def _even_weights(unrolled: np.ndarray) -> np.ndarray:
     np.add.at(counts, place, 1)
     # means over the neighbourhood, which only cells with points count for
     sums, occupied = (uniform_filter(each, WINDOW, mode="constant") for each in (counts, np.sign(counts)))
-    return np.asarray(occupied[place] / sums[place])
+    return occupied[place] / sums[place]
 
 
 def _patch_misfit(
@@ -484,7 +484,7 @@ def _section_points(f: Feature, points: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 def _nearest_rows(points: np.ndarray, places: np.ndarray) -> np.ndarray:
     """The rows (m,) of ``points`` (n, 3) nearest to places (m, 3)."""
-    return np.asarray(cKDTree(points).query(places)[1])
+    return cKDTree(points).query(places)[1]
 
 
 def _direction_of(f: Feature) -> np.ndarray:

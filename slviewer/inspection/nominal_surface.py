@@ -77,7 +77,7 @@ class NominalSurface:
     def seen_from(self, places: np.ndarray, facing: np.ndarray, view: np.ndarray, least: float) -> np.ndarray:
         """Return which places (n, 3) on the surface, facing (n, 3), are visible from far away in the direction ``view``
         (3,); ``least``: cosine between the two. Returns (n,) bool."""
-        is_visible: np.ndarray = facing @ view > least
+        is_visible = facing @ view > least
         lift = 1e-4 * self.diagonal
         origins = (places[is_visible] - self.middle + lift * facing[is_visible]).astype(np.float32)
         rays = np.concatenate([origins, np.broadcast_to(view, origins.shape)], axis=1).astype(np.float32)

@@ -43,7 +43,7 @@ class CutPlane:
 
     def drawn(self, points: np.ndarray) -> np.ndarray:
         """Return points (n, 3) in the drawing, (n, 2) mm: along and up."""
-        return np.asarray((points - self.origin) @ np.stack([self.along, self.up]).T)
+        return (points - self.origin) @ np.stack([self.along, self.up]).T
 
 
 def section(vertices: np.ndarray, faces: np.ndarray, plane: CutPlane) -> list[np.ndarray]:
@@ -158,5 +158,5 @@ def nearest_on_section(lines: list[np.ndarray], x: float, y: float | None = None
     heights = np.concatenate(met)
     if not heights.size:
         drawn = np.concatenate(lines)
-        return np.asarray(drawn[np.argmin(np.abs(drawn[:, 0] - x))])
+        return drawn[np.argmin(np.abs(drawn[:, 0] - x))]
     return np.array([x, heights.max() if y is None else heights[np.argmin(np.abs(heights - y))]])

@@ -61,7 +61,7 @@ def local_normals(sample: np.ndarray, points: np.ndarray) -> np.ndarray:
     _, near = cKDTree(thin).query(sample, k=min(count, len(thin)))
     patches = thin[near]
     patches = patches - patches.mean(axis=1, keepdims=True)
-    return np.asarray(np.linalg.eigh(np.einsum("nki,nkj->nij", patches, patches))[1][:, :, 0])
+    return np.linalg.eigh(np.einsum("nki,nkj->nij", patches, patches))[1][:, :, 0]
 
 
 def _fit_sample(kind: Kind, sample: np.ndarray, normals: np.ndarray | None, rng: np.random.Generator) -> Feature | None:

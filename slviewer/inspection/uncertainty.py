@@ -40,7 +40,7 @@ class Spread:
     @property
     def sigmas(self) -> np.ndarray:
         """(p,): standard deviations."""
-        return np.asarray(np.sqrt(np.diag(self.covariance)))
+        return np.sqrt(np.diag(self.covariance))
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +70,7 @@ def joint_covariance(a: Spread, b: Spread) -> np.ndarray:
 def draw_steps(covariance: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Draw `DRAWS` steps (draws, p) of parameters of a covariance (p, p)."""
     values, vectors = np.linalg.eigh(covariance)
-    return np.asarray(rng.normal(size=(DRAWS, len(values))) * np.sqrt(np.maximum(values, 0)) @ vectors.T)
+    return rng.normal(size=(DRAWS, len(values))) * np.sqrt(np.maximum(values, 0)) @ vectors.T
 
 
 def propagate_covariance(f: Callable[[np.ndarray], float], covariance: np.ndarray) -> float:
@@ -107,7 +107,7 @@ def scatter_covariance(points: np.ndarray, jacobian: np.ndarray, residuals: np.n
     together = inverse @ (sums.T @ sums) @ inverse * count / (count - p)
     # elementwise larger standard deviations, with the correlations of the patches
     ratio = np.sqrt(np.maximum(np.diag(plain) / np.maximum(np.diag(together), 1e-300), 1.0))
-    return np.asarray(together * np.outer(ratio, ratio))
+    return together * np.outer(ratio, ratio)
 
 
 def splined_shared(bundle: Bundle, axis: Axis, scale: float = 1.0, scale_sigma: float = 0.0) -> Shared:

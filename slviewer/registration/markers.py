@@ -214,7 +214,7 @@ def _select_steady(p: Floats, q: Floats, sigma: Floats) -> np.ndarray:
 
 def _largest_gaps(T: Floats, p: Floats, q: Floats) -> Floats:
     """Return the largest gap (n,) mm of each marker's corners after a motion (4, 4)."""
-    return np.asarray(np.linalg.norm(move_points(T, p) - q, axis=2).max(axis=1))
+    return np.linalg.norm(move_points(T, p) - q, axis=2).max(axis=1)
 
 
 def marker_notes(measured: Mapping[str, MeasuredMarkers]) -> list[str]:

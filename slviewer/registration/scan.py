@@ -69,7 +69,7 @@ def away_from_edges(points: np.ndarray, sigma_z: np.ndarray | None = None) -> np
         step = np.abs(second[..., 2] - first[..., 2]) > _STEEPEST * float(np.median(known)) + noisy
         for s in (_BUT_LAST, _BUT_FIRST):
             inside[tuple(s if k == axis else slice(None) for k in (0, 1))] &= ~step
-    return np.asarray(binary_erosion(inside, np.ones((3, 3), bool), _RIM_PX))
+    return binary_erosion(inside, np.ones((3, 3), bool), _RIM_PX)
 
 
 _BUT_LAST, _BUT_FIRST = slice(None, -1), slice(1, None)

@@ -82,7 +82,7 @@ def _intersect_board(samples: Samples, stereo: StereoModel, pose: str) -> np.nda
     T = stereo.poses[pose]
     rays = np.column_stack([stereo.rig.camera.undistort(samples.camera), np.ones(len(samples.camera))])
     with np.errstate(invalid="ignore", divide="ignore"):
-        return np.asarray(rays * ((T[:3, 2] @ T[:3, 3]) / (rays @ T[:3, 2]))[:, None])
+        return rays * ((T[:3, 2] @ T[:3, 3]) / (rays @ T[:3, 2]))[:, None]
 
 
 def _measure_depths(points: np.ndarray, stereo: StereoModel) -> np.ndarray:

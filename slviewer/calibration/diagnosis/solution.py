@@ -93,7 +93,7 @@ def _is_illuminated(pixels: np.ndarray, stereo: StereoModel) -> np.ndarray:
         projected = stereo.rig.project(np.column_stack([rays * z, np.full(len(rays), z)]))
         with np.errstate(invalid="ignore"):
             inside.append(((projected > -0.5) & (projected < size - 0.5)).all(1))
-    return np.asarray(np.sum(inside, axis=0) >= 2)
+    return np.sum(inside, axis=0) >= 2
 
 
 def _is_covered(observation: Observation, pixels: np.ndarray) -> np.ndarray:

@@ -17,7 +17,8 @@ from slviewer.calibration.observe import AXES, Observation
 from slviewer.errors import InputError
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.rig import StereoRig
-from slviewer.geometry.rigid import transform_from_rvec
+from slviewer.geometry.rigid import Floats, transform_from_rvec
+from slviewer.geometry.splines import cubic_basis
 
 SAMPLES = 1000
 """Number of pixels of the board at which the projector's coordinates are compared."""
@@ -35,10 +36,10 @@ class DriftView:
     ``projector`` coordinates (m, 2) px there, a column of NaN for an axis that was not captured."""
 
     name: str
-    points: NDArray[np.float64]
-    camera: NDArray[np.float64]
-    pixels: NDArray[np.float64]
-    projector: NDArray[np.float64]
+    points: Floats
+    camera: Floats
+    pixels: Floats
+    projector: Floats
 
     @classmethod
     def from_observation(cls, observation: Observation) -> "DriftView":
@@ -80,10 +81,11 @@ class DisplacementField:
         """Number of coefficients of one of the two components."""
         return (self.cells[0] + 3) * (self.cells[1] + 3)
 
-    def basis(self, pixels: NDArray[np.float64]) -> sp.csr_array:
+    def basis(self, pixels: Floats) -> sp.csr_array:
         """Return the spline basis (n, unknowns) at pixels (n, 2): displacement by coefficients."""
         (i, wu), (j, wv) = (
-            _splines_at((pixels[:, k] + 0.5) * self.cells[k] / self.size[k], self.cells[k]) for k in (0, 1)
+            cubic_basis(np.clip(pixels[:, k], -0.5, size - 0.5), -0.5, size - 0.5, cells)
+            for k, (size, cells) in enumerate(zip(self.size, self.cells, strict=True))
         )
         columns = (j[:, None] + np.arange(4))[:, :, None] * (self.cells[0] + 3) + (i[:, None] + np.arange(4))[:, None]
         values = wv[:, :, None] * wu[:, None]
@@ -115,17 +117,17 @@ class LinearView:
 
     name: str
     kinds: np.ndarray
-    residuals: NDArray[np.float64]
-    pose: NDArray[np.float64]
-    change: NDArray[np.float64]
-    scale: NDArray[np.float64]
+    residuals: Floats
+    pose: Floats
+    change: Floats
+    scale: Floats
     shared: sp.csr_array
-    across: NDArray[np.float64]
+    across: Floats
 
     @property
     def usable(self) -> NDArray[np.bool_]:
         """(k,) bool: the rows that were measured."""
-        return np.asarray(np.isfinite(self.residuals) & np.isfinite(self.change).all(1))
+        return np.isfinite(self.residuals) & np.isfinite(self.change).all(1)
 
 
 def linearise_view(rig: StereoRig, view: DriftView) -> LinearView:
@@ -190,15 +192,6 @@ def linearise_view(rig: StereoRig, view: DriftView) -> LinearView:
 def _flatten(camera: np.ndarray, projector: np.ndarray) -> np.ndarray:
     """Flatten values of features (n, 2) and of samples (m, 2) in the order of KINDS, (2 n + 2 m,)."""
     return np.concatenate([camera.ravel(), projector[:, 0], projector[:, 1]])
-
-
-def _splines_at(x: np.ndarray, cells: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return each position's cell (n,), clipped to the image, and its four cubic B-spline weights (n, 4)."""
-    x = np.clip(x, 0.0, cells)
-    cell = np.minimum(x.astype(np.int64), cells - 1)
-    f = x - cell
-    g = 1.0 - f
-    return cell, np.stack([g**3, 3 * f**3 - 6 * f**2 + 4, 3 * g**3 - 6 * g**2 + 4, f**3], 1) / 6.0
 
 
 def _solve_pose(rig: StereoRig, view: DriftView) -> np.ndarray:

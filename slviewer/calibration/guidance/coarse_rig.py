@@ -8,16 +8,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slviewer.calibration.splined.board_shape import (
-    GAUGE_MM,
-    HEIGHT_SIGMA_MM,
-    HEIGHT_TERMS,
-    OFFSET_SIGMA_MM,
-    board_frame,
-    offset_gauge,
-)
+from slviewer.calibration.splined.board_shape import HEIGHT_TERMS, board_frame, offset_gauge
 from slviewer.calibration.splined.fields import CELLS_ACROSS, RIDGE, Device, roughness
-from slviewer.calibration.splined.unknowns import Arrangement, UnknownLayout
+from slviewer.calibration.splined.prior import Prior
+from slviewer.calibration.splined.unknowns import Arrangement, State, UnknownLayout
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.rig import StereoRig
 from slviewer.geometry.rigid import Floats, move_points, nearest_rotation, rotation_angle, transform_from_rvec
@@ -95,10 +89,15 @@ class GuidanceModel:
         return board_frame(self.board.points)
 
     @cached_property
+    def state(self) -> State:
+        """Values of the unknowns without poses: a flat board."""
+        flat, offsets = np.zeros(HEIGHT_TERMS), np.zeros((len(self.points), 2))
+        return State(self.rig, np.zeros((0, 3, 3)), np.zeros((0, 3)), flat, offsets)
+
+    @property
     def layout(self) -> UnknownLayout:
         """Order of the unknowns, without poses."""
-        knots = [device.coefficients[0].size for device in (self.rig.camera, self.rig.projector)]
-        return UnknownLayout(0, len(self.points), knots[0], knots[1])
+        return self.state.layout
 
     @property
     def features_per_point(self) -> float:
@@ -135,23 +134,17 @@ class GuidanceModel:
         """Return the information matrix (unknowns, unknowns) before any pose, in the order of ``layout``."""
         at = self.layout
         A = np.zeros((at.size, at.size))
-        diagonal = np.arange(at.size)
-        A[diagonal[:HEIGHT_TERMS], diagonal[:HEIGHT_TERMS]] = HEIGHT_SIGMA_MM**-2.0
-        offsets = slice(at.offsets, at.rig)
-        each = np.eye(at.rig - at.offsets) * self.features_per_point / OFFSET_SIGMA_MM**2
-        gauge = offset_gauge(self.points)
-        A[offsets, offsets] = each + gauge.T @ gauge / GAUGE_MM**2
-        A[diagonal[at.rig : at.camera_field], diagonal[at.rig : at.camera_field]] = self._weak_prior_sigmas() ** -2.0
-        widths = self.stereo.camera.size[0], self.stereo.projector.size[0]
-        starts = at.camera_field, at.projector_field
-        for device, start, strength, width in zip(self.rig[:2], starts, self.expected.strengths, widths, strict=True):
-            n = device.coefficients[0].size
+        cell_ratio = CELLS_ACROSS / COARSE_CELLS
+        forms, strengths = [], []
+        for device, strength in zip(self.rig[:2], self.expected.strengths, strict=True):
             # the same curvature energy of a field, and the same ridge, as on the adjustment's knots
-            cell_ratio = CELLS_ACROSS / COARSE_CELLS
-            form = roughness(device.coefficients) + RIDGE * (cell_ratio**4 - 1) * np.eye(n)
-            for k in range(2):
-                block = slice(start + k * n, start + (k + 1) * n)
-                A[block, block] = strength / width**2 / cell_ratio**2 * form
+            form = roughness(device.coefficients)
+            forms.append(form + RIDGE * (cell_ratio**4 - 1) * np.eye(len(form)))
+            strengths.append(strength / device.size[0] ** 2 / cell_ratio**2)
+        prior = Prior((forms[0], forms[1]), offset_gauge(self.points), self.features_per_point)
+        prior.add(A, np.zeros(at.size), self.state, strengths)
+        rig = np.arange(at.rig, at.camera_field)
+        A[rig, rig] += self._weak_prior_sigmas() ** -2.0
         return A
 
     def _weak_prior_sigmas(self) -> Floats:

@@ -107,4 +107,4 @@ def _select_extremes(places: Floats) -> list[int]:
 def _pose_distances(T: Floats, others: Floats) -> Floats:
     """Return distances (n,) of a pose (4, 4) to others (n, 4, 4): shift over 0.1 depth, plus turn over 15 degrees."""
     translations = np.linalg.norm(T[:3, 3] - others[:, :3, 3], axis=1) / (0.1 * T[2, 3])
-    return np.asarray(translations + rotation_angle(T[:3, :3].T @ others[:, :3, :3]) / np.radians(15))
+    return translations + rotation_angle(T[:3, :3].T @ others[:, :3, :3]) / np.radians(15)

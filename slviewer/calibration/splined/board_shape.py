@@ -30,7 +30,7 @@ def offset_gauge(points: np.ndarray) -> np.ndarray:
     x, y = (points[:, :2] - points[:, :2].mean(0)).T
     one, none = np.ones_like(x), np.zeros_like(x)
     rows = np.array([np.stack(pair, 1).ravel() for pair in ((one, none), (none, one), (-y, x), (x, y))])
-    return np.asarray(rows / np.linalg.norm(rows, axis=1, keepdims=True))
+    return rows / np.linalg.norm(rows, axis=1, keepdims=True)
 
 
 @kernel()

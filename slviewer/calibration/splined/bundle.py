@@ -15,6 +15,7 @@ from slviewer.calibration.splined.posterior import compute_point_jacobian
 from slviewer.calibration.splined.residual_noise import Noise
 from slviewer.calibration.splined.unknowns import Arrangement, State
 from slviewer.fringe.sequence import Axis
+from slviewer.geometry.rigid import Floats
 from slviewer.records import from_plain, to_plain
 
 
@@ -43,7 +44,7 @@ class Bundle:
 
     state: State
     poses: tuple[str, ...]
-    points: NDArray[np.float64]
+    points: Floats
     noise: Noise
     strengths: tuple[float, float]
     fits: Mapping[str, PoseFit]
@@ -77,7 +78,7 @@ class Bundle:
         """Return Y (unknowns, m), where Y.T @ Y is the covariance of the values with ``jacobian`` (m, unknowns)."""
         dense = jacobian if isinstance(jacobian, np.ndarray) else jacobian.toarray()
         right = np.asarray(dense, self.factor.dtype).T
-        return np.asarray(solve_triangular(self.factor, right, lower=True, check_finite=False))
+        return solve_triangular(self.factor, right, lower=True, check_finite=False)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the fields that are not arrays, as JSON types."""

@@ -62,7 +62,7 @@ def detect_half_turns(state: State, data: PoseData, residuals: np.ndarray, certa
     agree = np.einsum("pn,pn->p", unit, others) / np.maximum(np.linalg.norm(others, axis=1), 1e-12)
     # of two features that are each other's opposite only one counts, and what is smooth does not
     freedom = max(len(data.points) - (SMOOTH_DEGREE + 1) * (SMOOTH_DEGREE + 2) // 2, 1)
-    return np.asarray((agree * np.sqrt(freedom) < -DECISION_SIGMAS) & ~certain)
+    return (agree * np.sqrt(freedom) < -DECISION_SIGMAS) & ~certain
 
 
 def renumber_poses(state: State, data: PoseData, poses: np.ndarray) -> tuple[State, PoseData]:
@@ -109,4 +109,4 @@ def _odd_part(places: np.ndarray, partner: np.ndarray, points: np.ndarray) -> np
     odd = (places + places[:, partner]) / 2
     basis, _ = np.linalg.qr(monomials(scale_to_unit_square(points[:, :2]), SMOOTH_DEGREE))
     odd = odd - np.einsum("fk,gk,pgc->pfc", basis, basis, odd, optimize=True)
-    return np.asarray(odd.reshape(len(places), -1))
+    return odd.reshape(len(places), -1)

@@ -3,13 +3,13 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from slviewer.calibration.splined.fields import Device, distort_to_pixel, undistort_pixel
+from slviewer.calibration.splined.fields import Device, project_point, undistort_pixel
 from slviewer.calibration.splined.unknowns import Arrangement
 from slviewer.errors import InputError
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.jit import kernel
+from slviewer.geometry.rigid import Floats
 
 DEPTH_FACTORS = (0.87, 1.13)
 """Of the nearest and the farthest calibrated depth: in front of them (R1), inside (R2) and behind (R3), as the Letter
@@ -24,10 +24,10 @@ class Volume:
     (n, 2).
     """
 
-    pixels: NDArray[np.float64]
-    z: NDArray[np.float64]
-    points: NDArray[np.float64]
-    projector: NDArray[np.float64]
+    pixels: Floats
+    z: Floats
+    points: Floats
+    projector: Floats
 
     def supported(
         self, rig: Arrangement, camera_illuminated: np.ndarray, projector_illuminated: np.ndarray
@@ -94,7 +94,7 @@ def is_supported(device: Device, pixels: np.ndarray, illuminated: np.ndarray) ->
     known = np.isfinite(pixels).all(axis=1)
     place = np.where(known[:, None], (pixels + 0.5) / device.size * shape, 0.0)
     cells = np.clip(place, 0, shape - 1).astype(int)
-    return np.asarray(illuminated[cells[:, 1], cells[:, 0]] & known)
+    return illuminated[cells[:, 1], cells[:, 0]] & known
 
 
 def depth_axis(rig: Arrangement, volume: Volume) -> Axis:
@@ -144,13 +144,13 @@ def remove_rigid_motion(whitened: np.ndarray, points: np.ndarray, fitted: np.nda
     """
     motion = BestMotion.fit(points, fitted)
     weights, moved = motion.weights.astype(whitened.dtype), motion.displace(points).astype(whitened.dtype)
-    return np.asarray(whitened - (whitened @ weights) @ moved.T)
+    return whitened - (whitened @ weights) @ moved.T
 
 
 def sigma_3d(whitened: np.ndarray) -> np.ndarray:
     """Return the 3D standard deviation (n,) mm of each point from a factor (m, 3 n) of the points' covariance."""
     squares = np.einsum("mn,mn->n", whitened, whitened, dtype=np.float64)
-    return np.asarray(np.sqrt(squares.reshape(-1, 3).sum(axis=1)))
+    return np.sqrt(squares.reshape(-1, 3).sum(axis=1))
 
 
 def _motion_basis(points: np.ndarray, centre: np.ndarray, arm: float) -> np.ndarray:
@@ -164,7 +164,7 @@ def _motion_basis(points: np.ndarray, centre: np.ndarray, arm: float) -> np.ndar
             [none, none, one, y, -x, none],
         ]
     )
-    return np.asarray(along.transpose(2, 0, 1).reshape(-1, 6))
+    return along.transpose(2, 0, 1).reshape(-1, 6)
 
 
 @kernel()
@@ -175,10 +175,4 @@ def _view_all(rig, pixels, depths, points, projector):
         x, y = undistort_pixel(rig.camera, pixels[n, 0], pixels[n, 1], basis)
         z = depths[n]
         points[n, 0], points[n, 1], points[n, 2] = x * z, y * z, z
-        X0 = z * (rig.R[0, 0] * x + rig.R[0, 1] * y + rig.R[0, 2]) + rig.t[0]
-        X1 = z * (rig.R[1, 0] * x + rig.R[1, 1] * y + rig.R[1, 2]) + rig.t[1]
-        X2 = z * (rig.R[2, 0] * x + rig.R[2, 1] * y + rig.R[2, 2]) + rig.t[2]
-        u = v = np.nan
-        if X2 > 0.0:  # False for NaN
-            u, v = distort_to_pixel(rig.projector, X0 / X2, X1 / X2, basis)
-        projector[n, 0], projector[n, 1] = u, v
+        projector[n, 0], projector[n, 1] = project_point(rig, x, y, z, basis)

@@ -103,5 +103,4 @@ def _fit_covariance(points: np.ndarray, ball: SphereResult) -> np.ndarray:
     """(4, 4) mm^2 of centre and radius, from the scatter of the points about the sphere."""
     offsets = points[ball.inliers].astype(np.float64) - ball.sphere.centre
     J = np.column_stack([offsets / np.linalg.norm(offsets, axis=1)[:, None], np.ones(len(offsets))])
-    covariance: np.ndarray = ball.rms_mm**2 * np.linalg.inv(J.T @ J)
-    return covariance
+    return ball.rms_mm**2 * np.linalg.inv(J.T @ J)
