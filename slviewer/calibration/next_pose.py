@@ -109,7 +109,7 @@ def depth_range(board: Board, lens: Lens) -> tuple[float, float]:
     return near, _DEPTH_RATIO * near
 
 
-def coverage(board: Board, lens: Lens, poses: Sequence[np.ndarray]) -> Coverage:
+def count_coverage(board: Board, lens: Lens, poses: Sequence[np.ndarray]) -> Coverage:
     """Count how often `poses`, T_camera_board (4, 4) mm each, cover the cells, depths and tilts."""
     span = depth_range(board, lens)
     covered, thirds, tilts = _classify(board, lens, np.reshape(poses, (-1, 4, 4)), span)
@@ -136,7 +136,7 @@ def suggest(
     is known (see `projector_reach`). `skip`: number of better suggestions to skip, which were refused before. Raises
     InputError where no pose shows the whole board.
     """
-    current = coverage(board, lens, poses)
+    current = count_coverage(board, lens, poses)
     candidates = _list_candidates(board, lens, current.range_mm, len(poses), illuminated)
     if not len(candidates):
         raise InputError(f"the board {board} cannot be held so that the camera sees all of it: take a smaller board")

@@ -9,7 +9,7 @@ from slviewer.calibration.pixelwise import PixelwiseModel
 from slviewer.calibration.splined.fields import Device, undistort
 from slviewer.calibration.splined.model import SplinedModel
 from slviewer.calibration.splined.unknowns import pinhole_lens
-from slviewer.calibration.splined.volume import is_supported
+from slviewer.calibration.splined.volume import in_illuminated_cells
 from slviewer.errors import InputError
 from slviewer.geometry.lens import Lens
 
@@ -92,5 +92,5 @@ def _fit_device(device: Device, illuminated: np.ndarray) -> PinholeFit:
     down = np.linspace(0, height - 1, max(2, round(GRID * height / width)))
     u, v = np.meshgrid(across, down)
     pixels = np.column_stack([u.ravel(), v.ravel()])
-    rays = np.where(is_supported(device, pixels, illuminated)[:, None], undistort(device, pixels), np.nan)
+    rays = np.where(in_illuminated_cells(device, pixels, illuminated)[:, None], undistort(device, pixels), np.nan)
     return fit_lens(pixels, rays, pinhole_lens(device))

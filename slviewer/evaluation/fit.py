@@ -88,7 +88,7 @@ def within_sigmas(residuals: np.ndarray, points: np.ndarray) -> np.ndarray:
     return np.abs(residuals - np.median(residuals)) <= reach
 
 
-def measure(
+def fit_shape(
     points: np.ndarray,
     mask: np.ndarray,
     sigma_z: np.ndarray | None,

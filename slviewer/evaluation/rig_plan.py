@@ -124,7 +124,7 @@ def place(camera: PlannedCamera, projector: PlannedProjector, distance: float, b
     return StereoRig(Lens(K, np.zeros(5), camera.size), Lens(K_p, np.zeros(5), projector.size), R, -R @ centre)
 
 
-def plan_rig(
+def predict_rig(
     camera: PlannedCamera,
     projector: PlannedProjector,
     distance: float,

@@ -43,15 +43,13 @@ class Lens:
                 f"A camera matrix must read [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], this one is {K.tolist()}: "
                 "check the key and calibrate without skew."
             )
-        if D.size > 5 and not D[5:].any():
-            D = D[:5]
-        if D.size not in (0, 4, 5) or not np.isfinite(D).all():
+        if D.size in (1, 2, 3) or D[5:].any() or not np.isfinite(D).all():
             raise InputError(
                 f"{D.size} distortion coefficients were given, {D.tolist()}, and this lens has five "
                 "(k1, k2, p1, p2, k3): calibrate without the rational, thin-prism and tilted models."
             )
-        D = np.concatenate([D, np.zeros(5 - D.size)])
-        width, height = (int(n) for n in self.size)
+        D = np.concatenate([D, np.zeros(5)])[:5]
+        width, height = map(int, self.size)
         if not (1 <= width <= LARGEST_PX and 1 <= height <= LARGEST_PX):
             raise InputError(
                 f"An image of {width}x{height} px was given: its size is width x height, 1 to {LARGEST_PX} px each."

@@ -153,8 +153,8 @@ def _fit_cylinder(start: Feature, points: np.ndarray) -> Feature:
     feature = start.moved(solution.x)
     if not 0 < (feature.radius or 0.0) < MAX_RADIUS_RATIO * float(np.linalg.norm(np.ptp(points, axis=0))):
         raise InputError("No cylinder fits: its radius diverges; select a region that shows more of its curve.")
-    assert feature.direction is not None
-    along = feature.direction * np.sign(feature.direction[np.argmax(np.abs(feature.direction))])
+    axis = feature.unit_direction
+    along = axis * np.sign(axis[np.argmax(np.abs(axis))])
     middle = feature.place + ((points.mean(axis=0) - feature.place) @ along) * along
     return Feature("cylinder", middle, along, feature.radius)
 
@@ -224,9 +224,9 @@ def _residual_of(kind: Kind, points: np.ndarray) -> float:
 
 def _residual_from_quadric(plane: Feature, points: np.ndarray) -> float:
     """Return the robust sigma in mm about the quadratic surface over a plane: curvature removed, noise remains."""
-    assert plane.direction is not None
+    normal = plane.unit_direction
     offsets = points - points.mean(axis=0)
-    _, _, axes = np.linalg.svd(offsets - (offsets @ plane.direction)[:, None] * plane.direction, full_matrices=False)
+    _, _, axes = np.linalg.svd(offsets - (offsets @ normal)[:, None] * normal, full_matrices=False)
     u, v = offsets @ axes[0], offsets @ axes[1]
     basis = np.column_stack([np.ones_like(u), u, v, u * u, u * v, v * v])
     heights = plane.distance(points)

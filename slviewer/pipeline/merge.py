@@ -21,7 +21,7 @@ from slviewer.pipeline.scale import describe_scale, scale_factor
 from slviewer.pipeline.scan_edits import resolve_region, restrict_cloud, restriction_notes
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.registration.markers import MeasuredMarkers, fit_marker_pose, marker_notes, measure_markers
-from slviewer.registration.multiway import Alignment, Pair, Starts
+from slviewer.registration.multiway import MultiwayAlignment, Pair, Starts
 from slviewer.registration.pairwise import Registration
 from slviewer.registration.picked import fit_picked_start
 from slviewer.registration.refusal import Refused
@@ -52,7 +52,7 @@ class Merge:
     comes from, 0 for the first of ``fused.names``.
     """
 
-    alignment: Alignment
+    alignment: MultiwayAlignment
     fused: Fused
     clouds: Mapping[str, Cloud]
     out: Path
@@ -322,7 +322,7 @@ def _measure_mat(
     return measured
 
 
-def _list_moved_markers(alignment: Alignment) -> list[str]:
+def _list_moved_markers(alignment: MultiwayAlignment) -> list[str]:
     """A sentence for each pair between whose scans markers have moved."""
     return [
         f"{a} -> {b}: marker {', '.join(map(str, pose.moved))} has moved between the scans, and is ignored: "

@@ -25,7 +25,7 @@ BOARD_SAMPLES = 4000
 """Bright pixels that a pose contributes to the joint adjustment."""
 MARGIN = 0.006
 """Margin around the outermost features in a visible pose, in widths of the image."""
-MIN_POSES = 3
+MIN_POSES, MIN_FEATURES = 3, 12
 MAX_FEATURES = 60
 """Features of a pose from which a rig is estimated."""
 POSES_FOR_TWO_COEFFICIENTS = 6
@@ -181,36 +181,44 @@ def estimate_rig(
     Of each pose: ``points`` (n, 3) mm on the board, and their ``camera`` and ``projector`` pixels (n, 2), NaN where
     unknown. ``sizes``: (width, height) px of camera and projector.
     """
-    chosen = []
-    for p, c, q in zip(points, camera, projector, strict=True):
-        known = np.nonzero(np.isfinite(c).all(1) & np.isfinite(q).all(1))[0]
-        if len(known) < 12:
-            return None
-        subset = known[np.unique(np.linspace(0, len(known) - 1, MAX_FEATURES).astype(int))]
-        chosen.append([np.ascontiguousarray(a[subset], np.float32) for a in (p, c, q)])
-    if len(chosen) < MIN_POSES:
+    features = [_select_features(*each) for each in zip(points, camera, projector, strict=True)]
+    if len(features) < MIN_POSES or any(len(each[0]) < MIN_FEATURES for each in features):
         return None
-    flags = cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
-    if len(chosen) < POSES_FOR_TWO_COEFFICIENTS:
-        flags |= cv2.CALIB_FIX_K2
-    lenses, poses = [], []
-    for k, size in enumerate(sizes):
-        objects, images = [c[0] for c in chosen], [c[1 + k] for c in chosen]
-        try:
-            _, K, D, rvecs, tvecs = cv2.calibrateCamera(objects, images, size, np.eye(3), np.zeros(5), flags=flags)
-        except cv2.error:
-            return None
-        if not (np.isfinite(K).all() and all(_FOCALS[0] < f / size[0] < _FOCALS[1] for f in (K[0, 0], K[1, 1] / 2))):
-            return None
-        lenses.append(Lens(K, np.ravel(D)[:5], size))
-        poses.append([transform_from_rvec(r, t) for r, t in zip(rvecs, tvecs, strict=True)])
+    boards, *images = zip(*features, strict=True)
+    devices = [_calibrate_device(boards, seen, size) for seen, size in zip(images, sizes, strict=True)]
+    if devices[0] is None or devices[1] is None:
+        return None
+    lenses, poses = zip(*devices, strict=True)
     T = np.array(poses[1]) @ np.linalg.inv(poses[0])  # T_projector_camera by each pose
     t = np.median(T[:, :3, 3], axis=0)
     R = nearest_rotation(np.median(T[:, :3, :3], axis=0))
     rotation = np.median(rotation_angle(T[:, :3, :3] @ R.T))
     translation = np.median(np.linalg.norm(T[:, :3, 3] - t, axis=1)) / max(float(np.linalg.norm(t)), 1e-9)
-    if rotation > MAX_DISAGREEMENT[0] or translation > MAX_DISAGREEMENT[1]:
-        return None
-    if any(pose[2, 3] <= 0 for pose in poses[0]):
+    is_behind = any(pose[2, 3] <= 0 for pose in poses[0])
+    if rotation > MAX_DISAGREEMENT[0] or translation > MAX_DISAGREEMENT[1] or is_behind:
         return None
     return StereoRig(lenses[0], lenses[1], R, t), poses[0]
+
+
+def _select_features(points: np.ndarray, camera: np.ndarray, projector: np.ndarray) -> list[NDArray[np.float32]]:
+    """Return at most MAX_FEATURES of a pose's points and pixels (k, ...) float32, of those that both devices see."""
+    known = np.nonzero(np.isfinite(camera).all(1) & np.isfinite(projector).all(1))[0]
+    if len(known):
+        known = known[np.unique(np.linspace(0, len(known) - 1, MAX_FEATURES).astype(int))]
+    return [np.ascontiguousarray(each[known], np.float32) for each in (points, camera, projector)]
+
+
+def _calibrate_device(
+    points: Sequence[np.ndarray], pixels: Sequence[np.ndarray], size: tuple[int, int]
+) -> tuple[Lens, list[Floats]] | None:
+    """Estimate a lens and T_device_board (4, 4) mm of each pose; None without a plausible solution."""
+    flags = cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
+    if len(points) < POSES_FOR_TWO_COEFFICIENTS:
+        flags |= cv2.CALIB_FIX_K2
+    try:
+        _, K, D, rvecs, tvecs = cv2.calibrateCamera(points, pixels, size, np.eye(3), np.zeros(5), flags=flags)
+    except cv2.error:
+        return None
+    if not (np.isfinite(K).all() and all(_FOCALS[0] < f / size[0] < _FOCALS[1] for f in (K[0, 0], K[1, 1] / 2))):
+        return None
+    return Lens(K, np.ravel(D)[:5], size), [transform_from_rvec(r, t) for r, t in zip(rvecs, tvecs, strict=True)]

@@ -20,7 +20,7 @@ from slviewer.calibration.splined.normal import (
 )
 from slviewer.calibration.splined.posterior import compute_point_jacobian
 from slviewer.calibration.splined.residuals import HEIGHT, feature_row, sample_row
-from slviewer.calibration.splined.volume import Volume, depth_axis, remove_rigid_motion, working_volume
+from slviewer.calibration.splined.volume import Volume, remove_rigid_motion, select_depth_axis, working_volume
 from slviewer.geometry.jit import kernel
 from slviewer.geometry.rigid import Floats
 
@@ -41,7 +41,9 @@ class VolumeSensitivity:
     def from_model(cls, model: GuidanceModel, depths_mm: tuple[float, float]) -> "VolumeSensitivity":
         """Compute the Jacobian of a regular grid of points; ``depths_mm``: nearest and farthest board."""
         volume = working_volume(model.rig, depths_mm)
-        by_rig = compute_point_jacobian(model.state, depth_axis(model.rig, volume), volume.pixels, volume.z).toarray()
+        by_rig = compute_point_jacobian(
+            model.state, select_depth_axis(model.rig, volume), volume.pixels, volume.z
+        ).toarray()
         known = np.isfinite(by_rig).all(axis=1).reshape(-1, 3).all(axis=1)
         volume = Volume(volume.pixels[known], volume.z[known], volume.points[known], volume.projector[known])
         by_rig = by_rig.reshape(len(known), 3, -1)[known].reshape(3 * len(volume.z), -1)

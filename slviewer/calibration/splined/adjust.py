@@ -46,8 +46,26 @@ def gather_data(observations: Sequence[Observation], stereo: StereoModel) -> tup
     Returns their names, the observations, and the samples' predicted noise (m, 2) px. Raises InputError for fewer than
     MIN_POSES poses with both axes, and for observations without samples.
     """
-    used = [o for o in observations if o.name in stereo.poses]
-    both = [o for o in used if len(o.surfaces) == 2]
+    both = _select_complete(observations, stereo)
+    every = np.concatenate([o.points for o in both])
+    points, feature = np.unique(np.round(every, 6), axis=0, return_inverse=True)
+    samples = [o.samples for o in both if o.samples is not None]
+    data = PoseData(
+        np.cumsum([0, *(len(o.points) for o in both)]),
+        feature.ravel().astype(np.int64),
+        np.ascontiguousarray(np.concatenate([o.camera for o in both])),
+        np.cumsum([0, *(len(s.camera) for s in samples)]),
+        np.concatenate([s.camera for s in samples]),
+        np.concatenate([s.projector for s in samples]),
+        points,
+        board_frame(points),
+    )
+    return [o.name for o in both], data, np.concatenate([s.sigma for s in samples])
+
+
+def _select_complete(observations: Sequence[Observation], stereo: StereoModel) -> list[Observation]:
+    """Select the observations of ``gather_data``; raises its errors."""
+    both = [o for o in observations if o.name in stereo.poses and len(o.surfaces) == 2]
     if len(both) < MIN_POSES:
         single = sorted({axis for o in observations for axis in o.surfaces}) if len(both) < len(observations) else []
         alone = f"; others hold axis {' or '.join(single)} alone" if single else ""
@@ -57,25 +75,7 @@ def gather_data(observations: Sequence[Observation], stereo: StereoModel) -> tup
         )
     if any(o.samples is None for o in both):
         raise InputError("these target poses were read without samples of their phase: calibrate from the frames again")
-    every = np.concatenate([o.points for o in both])
-    points, feature = np.unique(np.round(every, 6), axis=0, return_inverse=True)
-    samples = [o.samples for o in both if o.samples is not None]
-
-    def starts(lengths: list[int]) -> np.ndarray:
-        """Return where each pose's entries start, and the end of the last."""
-        return np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64)
-
-    data = PoseData(
-        starts([len(o.points) for o in both]),
-        feature.ravel().astype(np.int64),
-        np.ascontiguousarray(np.concatenate([o.camera for o in both])),
-        starts([len(s.camera) for s in samples]),
-        np.concatenate([s.camera for s in samples]),
-        np.concatenate([s.projector for s in samples]),
-        points,
-        board_frame(points),
-    )
-    return [o.name for o in both], data, np.concatenate([s.sigma for s in samples])
+    return both
 
 
 def adjust_bundle(

@@ -16,7 +16,7 @@ from slviewer.calibration.splined.fields import undistort
 from slviewer.calibration.splined.residual_noise import MIN_SIGMA_PX
 from slviewer.calibration.splined.uncertainty import SigmaMap, compute_sigma_map, summarise_volume_sigma
 from slviewer.calibration.splined.unknowns import Arrangement, pinhole_lens
-from slviewer.calibration.splined.volume import depth_axis, is_supported, working_volume
+from slviewer.calibration.splined.volume import in_illuminated_cells, select_depth_axis, working_volume
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import InputError
 from slviewer.fringe.phase import PhaseMap
@@ -74,7 +74,7 @@ class SplinedModel:
         NaN where no target pose illuminated the cell of one of them.
         """
         rays = undistort(self.rig.camera, pixels), undistort(self.rig.projector, projector)
-        known = is_supported(self.rig.camera, pixels, self.bundle.camera_poses > 0) & is_supported(
+        known = in_illuminated_cells(self.rig.camera, pixels, self.bundle.camera_poses > 0) & in_illuminated_cells(
             self.rig.projector, projector, self.bundle.projector_poses > 0
         )
         return np.where(known[:, None], rays[0], np.nan), np.where(known[:, None], rays[1], np.nan)
@@ -101,7 +101,7 @@ class SplinedModel:
 
     def compile_depth(self) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         """Compile the axis along which depth is measured, and its uncertainty; `restore_compiled` takes the result."""
-        axis = depth_axis(self.rig, working_volume(self.rig, self.bundle.depth_range_mm))
+        axis = select_depth_axis(self.rig, working_volume(self.rig, self.bundle.depth_range_mm))
         fast, sigma = self.fast_axis(axis), self.sigma_map(axis)
         data = {"axis": axis, "centre": fast.centre, "step": fast.step, "near": fast.near, "far": fast.far}
         return data, {

@@ -21,9 +21,9 @@ from slviewer.calibration.splined.fields import Device
 from slviewer.calibration.splined.volume import (
     BestMotion,
     Volume,
-    depth_axis,
-    is_supported,
+    in_illuminated_cells,
     remove_rigid_motion,
+    select_depth_axis,
     sigma_3d,
     view_pixels,
     working_volume,
@@ -109,7 +109,7 @@ def extrapolation_factor(bundle: Bundle, places: Volume) -> Floats:
         (rig.camera, places.pixels, bundle.camera_poses),
         (rig.projector, places.projector, bundle.projector_poses),
     ):
-        supported = is_supported(device, pixels, poses > 0)
+        supported = in_illuminated_cells(device, pixels, poses > 0)
         factor = np.where(supported, factor, np.maximum(factor, persistence_ratio(device, poses > 0)))
     return factor
 
@@ -143,7 +143,7 @@ def summarise_volume_sigma(bundle: Bundle) -> dict[str, Any]:
     """
     rig = bundle.state.rig
     volume = working_volume(rig, bundle.depth_range_mm)
-    axis = depth_axis(rig, volume)
+    axis = select_depth_axis(rig, volume)
     fitted = _select_fitted(bundle, volume)
     sigma = volume_sigmas(bundle, axis, volume)
     worst = int(np.argmax(sigma))

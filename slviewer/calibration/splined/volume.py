@@ -33,7 +33,7 @@ class Volume:
         self, rig: Arrangement, camera_illuminated: np.ndarray, projector_illuminated: np.ndarray
     ) -> np.ndarray:
         """(n,) bool: points in cells (rows, columns) bool that target poses illuminated, in both devices."""
-        return is_supported(rig.camera, self.pixels, camera_illuminated) & is_supported(
+        return in_illuminated_cells(rig.camera, self.pixels, camera_illuminated) & in_illuminated_cells(
             rig.projector, self.projector, projector_illuminated
         )
 
@@ -85,7 +85,7 @@ def view_pixels(rig: Arrangement, pixels: np.ndarray, z: np.ndarray) -> tuple[np
     return points, projector
 
 
-def is_supported(device: Device, pixels: np.ndarray, illuminated: np.ndarray) -> np.ndarray:
+def in_illuminated_cells(device: Device, pixels: np.ndarray, illuminated: np.ndarray) -> np.ndarray:
     """(n,) bool: whether ``pixels`` (n, 2) are in cells (rows, columns) bool that target poses illuminated.
 
     Pixels outside the image count to the cell at its edge; False for NaN.
@@ -97,7 +97,7 @@ def is_supported(device: Device, pixels: np.ndarray, illuminated: np.ndarray) ->
     return illuminated[cells[:, 1], cells[:, 0]] & known
 
 
-def depth_axis(rig: Arrangement, volume: Volume) -> Axis:
+def select_depth_axis(rig: Arrangement, volume: Volume) -> Axis:
     """Return the projector axis whose coordinate changes more with depth, in the median over the volume."""
     _, later = view_pixels(rig, volume.pixels, 1.001 * volume.z)
     across, down = np.nanmedian(np.abs(later - volume.projector), axis=0)

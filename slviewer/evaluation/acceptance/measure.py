@@ -39,7 +39,7 @@ class Position:
         return max((f for f in self.figures if f.property == name), key=lambda f: abs(f.error_mm))
 
 
-def measure(
+def measure_artefact(
     artefact: Artefact,
     cloud: Cloud,
     position: str,

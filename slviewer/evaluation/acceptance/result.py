@@ -9,7 +9,7 @@ from scipy.special import stdtrit
 
 from slviewer.errors import InputError
 from slviewer.evaluation.acceptance.artefact import Artefact
-from slviewer.evaluation.acceptance.figures import K_95, K_997, RULE, Decision, Judgement, judge
+from slviewer.evaluation.acceptance.figures import K_95, K_997, RULE, Decision, Judgement, judge_property
 from slviewer.evaluation.acceptance.measure import FLATNESS, FORM, SIZE, SPACING, Position
 from slviewer.evaluation.render import Row, render
 from slviewer.records import to_plain
@@ -150,7 +150,7 @@ def conclude_test(artefact: Artefact, model: str, positions: Sequence[Position])
     limits = artefact.limits
     allowed = {FORM: limits.form_mm, SIZE: limits.size_mm, SPACING: limits.spacing_mm, FLATNESS: limits.flatness_mm}
     present = {figure.property for figure in figures}
-    judgements = tuple(judge(name, figures, limit) for name, limit in allowed.items() if name in present)
+    judgements = tuple(judge_property(name, figures, limit) for name, limit in allowed.items() if name in present)
     return Acceptance(artefact, model, tuple(positions), judgements, _estimate_scale(artefact, positions))
 
 
