@@ -11,9 +11,11 @@ from itertools import product
 import cv2
 import numpy as np
 
+from slviewer.calibration.board_pose import solve_pose
 from slviewer.errors import InputError
 from slviewer.geometry.lens import Lens
-from slviewer.geometry.rigid import move_points, rigid_transform, transform_from_rvec
+from slviewer.geometry.polynomial import grid_points
+from slviewer.geometry.rigid import move_points, rigid_transform
 from slviewer.target.board import Board
 
 COLUMNS, ROWS = 4, 3
@@ -70,7 +72,7 @@ def nominal_lens(size: tuple[int, int], focal_px: float | None = None) -> Lens:
     """Return a lens without distortion; without `focal_px` a typical focal length is assumed."""
     width, height = size
     f = focal_px or NOMINAL_FOCAL * width
-    return Lens(np.array([[f, 0, (width - 1) / 2], [0, f, (height - 1) / 2], [0, 0, 1]]), np.zeros(5), size)
+    return Lens.from_parameters((f, f, (width - 1) / 2, (height - 1) / 2), size)
 
 
 def estimated_lens(points: Sequence[np.ndarray], pixels: Sequence[np.ndarray], size: tuple[int, int]) -> Lens:
@@ -90,16 +92,8 @@ def approximate_pose(points: np.ndarray, pixels: np.ndarray, lens: Lens) -> np.n
     """Estimate T_camera_board (4, 4) mm from points (n, 3) mm and pixels (n, 2); None where there is no solution."""
     if len(points) < 4:
         return None
-    try:
-        success, rvec, tvec = cv2.solvePnP(
-            np.asarray(points, float), np.asarray(pixels, float), lens.K, lens.D, flags=cv2.SOLVEPNP_IPPE
-        )
-    except cv2.error:
-        return None
-    if not (success and np.isfinite(rvec).all() and np.isfinite(tvec).all()):
-        return None
-    T = transform_from_rvec(rvec, tvec)
-    return T if T[2, 3] > 0 else None
+    T = solve_pose(points, pixels, lens.K, lens.D, cv2.SOLVEPNP_IPPE)
+    return None if T is None or T[2, 3] <= 0 else T
 
 
 def depth_range(board: Board, lens: Lens) -> tuple[float, float]:
@@ -241,8 +235,7 @@ def _classify(
     board: Board, lens: Lens, T: np.ndarray, span: tuple[float, float]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the covered cells (n, 3, 4) bool, third of the depths (n,), index in `TILTS` (n,) of poses (n, 4, 4)."""
-    u, v = np.meshgrid(*((np.arange(n * _FINE) + 0.5) / (n * _FINE) for n in (COLUMNS, ROWS)))
-    samples = np.stack([u, v], -1).reshape(-1, 2) * np.array(lens.size)
+    samples = grid_points(*((np.arange(n * _FINE) + 0.5) / (n * _FINE) for n in (COLUMNS, ROWS))) * np.array(lens.size)
     corners = outline_px(board, lens, T)[:, None]
     sides = np.roll(corners, -1, -2) - corners
     away = samples[:, None] - corners

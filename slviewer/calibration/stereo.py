@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from slviewer.calibration.board_pose import CRITERIA, solve_device
 from slviewer.calibration.observe import Observation
 from slviewer.calibration.soundness import check_handedness, check_pose_count, check_tilts
 from slviewer.errors import CalibrationRejected
@@ -25,7 +26,6 @@ MAX_FOCAL_SIGMA = 0.05
 MAX_REPROJECTION_PX = 2.0
 """Above this the features and the model do not belong together, whatever the cause."""
 ROBUST_SIGMAS = 6.0
-ITERATIONS = 200
 _SAVED_KEYS = {"excluded": "left_out", "features_excluded": "features_set_aside"}
 """Keys on disk of the fields whose names differ from them."""
 
@@ -148,7 +148,7 @@ def calibrate_stereo(
         else:
             inliers[observation.name] = measured
     used = [o for o in observations if o.name in inliers]
-    check_pose_count(used, excluded)
+    check_pose_count(len(used), excluded)
     if strict:
         check_handedness(used)
         check_tilts(used)
@@ -166,7 +166,7 @@ def calibrate_stereo(
                     "was the board moved during the capture, or its grid shifted?"
                 )
                 used = [o for o in used if o.name != name]
-        check_pose_count(used, excluded)
+        check_pose_count(len(used), excluded)
     else:  # the last round excluded features or poses too
         solution = _Solution.fit(used, inliers, projector_size, strict)
     model = solution.to_model(used, inliers, board, excluded)
@@ -199,27 +199,18 @@ class _Solution:
         objects = [o.points[inliers[o.name]].astype(np.float32) for o in used]
         cameras = [o.camera[inliers[o.name]].astype(np.float32) for o in used]
         projectors = [o.projector[inliers[o.name]].astype(np.float32) for o in used]
-        criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, ITERATIONS, 1e-9)
         sigma: dict[str, float] = {}
         intrinsics = []
         for device, images, size in (("camera", cameras, used[0].size), ("projector", projectors, projector_size)):
-            try:
-                _, K, D, _, _, deviations, _, _ = cv2.calibrateCameraExtended(
-                    objects, images, size, np.zeros((3, 3)), np.zeros(5), criteria=criteria
-                )
-            except cv2.error as error:
-                raise CalibrationRejected(
-                    f"the {device}'s lens could not be solved from {len(used)} poses: "
-                    f"capture the board in more positions and tilts ({error.err})"
-                ) from error
-            sigma[device] = float(np.max(deviations.ravel()[:2]))
+            K, D, _, sigmas = solve_device(device, objects, images, size)
+            sigma[device] = max(sigmas)
             relative = sigma[device] / float(min(K[0, 0], K[1, 1]))
             if strict and not relative < MAX_FOCAL_SIGMA:
                 raise CalibrationRejected(
                     f"the poses leave the {device}'s focal length uncertain by {100 * relative:.0f} %: "
                     "tilt the board by 15 to 30 degrees in different directions, and vary its distance"
                 )
-            intrinsics.append((K, D.ravel()[:5]))
+            intrinsics.append((K, D))
         (K_c, D_c), (K_p, D_p) = intrinsics
         _, K_c, D_c, K_p, D_p, R, T, _, _, rvecs, tvecs, _ = cv2.stereoCalibrateExtended(
             objects,
@@ -233,7 +224,7 @@ class _Solution:
             np.eye(3),
             np.zeros((3, 1)),
             flags=cv2.CALIB_USE_INTRINSIC_GUESS,
-            criteria=criteria,
+            criteria=CRITERIA,
         )
         for device, K in (("camera", K_c), ("projector", K_p)):
             if not min(K[0, 0], K[1, 1]) > 0:

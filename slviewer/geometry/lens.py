@@ -1,5 +1,6 @@
 """A camera or a projector as a pinhole with Brown distortion: from points to pixels and from pixels to rays."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -69,6 +70,12 @@ class Lens:
         object.__setattr__(self, "K", K)
         object.__setattr__(self, "D", D)
         object.__setattr__(self, "size", (width, height))
+
+    @classmethod
+    def from_parameters(cls, parameters: Iterable[float], size: tuple[int, int]) -> "Lens":
+        """Return the lens of fx, fy, cx, cy in px, and distortion coefficients in OpenCV's order, if any."""
+        fx, fy, cx, cy, *D = parameters
+        return cls(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]), np.array(D), size)
 
     @cached_property
     def parameters(self) -> np.ndarray:

@@ -82,6 +82,21 @@ def monomials(points: np.ndarray, degree: int) -> np.ndarray:
     return np.stack([x[:, i] * y[:, j] for i in range(degree + 1) for j in range(degree + 1 - i)], axis=1)
 
 
+def fit_slopes(inputs: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return the slopes (k, m) of values (n, m) by ``inputs`` (n, k), by least squares with a constant.
+
+    Rows with NaN do not count.
+    """
+    known = np.isfinite(inputs).all(1) & np.isfinite(values).all(1)
+    design = np.column_stack([inputs[known], np.ones(np.count_nonzero(known))])
+    return np.linalg.lstsq(design, values[known], rcond=None)[0][:-1]
+
+
+def grid_points(*coordinates: np.ndarray) -> np.ndarray:
+    """Return all combinations (n, k) of so many ``coordinates``, the first varying fastest in two dimensions."""
+    return np.stack(np.meshgrid(*coordinates), axis=-1).reshape(-1, len(coordinates))
+
+
 def scale_to_unit_square(points: np.ndarray) -> np.ndarray:
     """Scale points (n, 2) so that their extent along x and along y is -1 to 1."""
     low = points.min(0)

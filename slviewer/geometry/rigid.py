@@ -41,6 +41,11 @@ def rotation_angle(R: Floats) -> Floats:
     return Rotation.from_matrix(R).magnitude()
 
 
+def largest_angle_deg(directions: Floats) -> float:
+    """Return the largest angle in degrees between two of the unit vectors (n, 3)."""
+    return float(np.degrees(np.arccos(np.clip(directions @ directions.T, -1, 1).min())))
+
+
 def fit_rigid(points: Floats, targets: Floats) -> Floats:
     """(..., 4, 4): the motion of least squares that brings points (..., n, 3) onto ``targets`` (..., n, 3), in order.
 

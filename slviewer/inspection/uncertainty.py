@@ -10,6 +10,7 @@ from slviewer.calibration.splined.uncertainty import extrapolation_factor
 from slviewer.calibration.splined.volume import BestMotion, Volume, view_pixels, working_volume
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.cubes import occupied_cubes
+from slviewer.geometry.polynomial import grid_points
 
 Shared = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """Called with points (m, 3) and how p parameters answer to their displacement (p, m, 3): (k, p), whose product with
@@ -140,8 +141,7 @@ def _pixels(bundle: Bundle, points: np.ndarray) -> np.ndarray:
     rig = bundle.state.rig
     width, height = (float(n) for n in rig.camera.size)
     # the rays of a coarse grid give a start that is linear in the normalised point
-    u, v = np.meshgrid(np.linspace(0, width - 1, 9), np.linspace(0, height - 1, 7))
-    grid = np.column_stack([u.ravel(), v.ravel()])
+    grid = grid_points(np.linspace(0, width - 1, 9), np.linspace(0, height - 1, 7))
     rays = view_pixels(rig, grid, np.ones(len(grid)))[0]
     known = np.isfinite(rays).all(axis=1)
     linear = np.linalg.lstsq(rays[known], grid[known], rcond=None)[0]

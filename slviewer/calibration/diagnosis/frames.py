@@ -11,6 +11,7 @@ from slviewer.fringe.phase import PhaseMap, Reason
 from slviewer.fringe.reference import bit_heights, dark_limit, dark_sigmas, phase_shift
 from slviewer.fringe.residual_sample import FEWEST, select_rows
 from slviewer.fringe.sequence import Axis, PatternSequence
+from slviewer.geometry.polynomial import fit_slopes
 
 ORIGIN_ROWS = 150
 """Image lines along which the Gray code's edges are located."""
@@ -203,6 +204,5 @@ def fit_mean_turn(camera: np.ndarray, projector: np.ndarray) -> tuple[tuple[floa
     known = np.isfinite(camera).all(1) & np.isfinite(projector).all(1)
     if np.count_nonzero(known) < 4:
         return None
-    design = np.column_stack([camera[known], np.ones(np.count_nonzero(known))])
-    (a, b), (c, d) = np.linalg.lstsq(design, projector[known], rcond=None)[0][:2].T
+    (a, b), (c, d) = fit_slopes(camera, projector).T
     return (float(a), float(b)), (float(c), float(d))

@@ -13,7 +13,7 @@ import numpy as np
 from slviewer.calibration.observe import AXES, Observation, Samples
 from slviewer.calibration.stereo import StereoModel
 from slviewer.fringe.sequence import Axis
-from slviewer.geometry.polynomial import fit_polynomial
+from slviewer.geometry.polynomial import fit_polynomial, fit_slopes
 from slviewer.geometry.robust import robust_sigma
 
 MAX_WAVES = 8
@@ -118,13 +118,11 @@ def _measure_blocks(camera: np.ndarray, periods: np.ndarray) -> np.ndarray:
 
     ``camera`` (n, 2) px: centres of a pose's blocks; ``periods`` (n,): their projector coordinates in fringe periods.
     """
-    known = np.isfinite(periods)
-    design = np.column_stack([camera[known], np.ones(np.count_nonzero(known))])
-    slopes = np.linalg.lstsq(design, periods[known], rcond=None)[0][:2]
+    slopes = np.abs(fit_slopes(camera, periods[:, None]))
     columns, counts = np.unique(np.round(2 * camera[:, 0]) / 2, return_counts=True)
     columns = columns[counts > 0.1 * counts.max()]  # whole blocks
     side = float(np.median(np.diff(columns))) if len(columns) > 1 else 1.0
-    return np.array([abs(slopes[0]), abs(slopes[1]), max(1.0, round(side))])
+    return np.array([*slopes[:, 0], max(1.0, round(side))])
 
 
 def _fit_ripple(samples: np.ndarray, mm_per_px: float, depth_mm: float) -> Ripple | None:

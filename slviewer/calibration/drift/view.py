@@ -13,11 +13,12 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
+from slviewer.calibration.board_pose import solve_pose
 from slviewer.calibration.observe import AXES, Observation
 from slviewer.errors import InputError
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.rig import StereoRig
-from slviewer.geometry.rigid import Floats, transform_from_rvec
+from slviewer.geometry.rigid import Floats
 from slviewer.geometry.splines import cubic_basis
 
 SAMPLES = 1000
@@ -196,11 +197,7 @@ def _flatten(camera: np.ndarray, projector: np.ndarray) -> np.ndarray:
 
 def _solve_pose(rig: StereoRig, view: DriftView) -> np.ndarray:
     """Solve T_camera_board (4, 4) mm from the features in the camera; raises InputError without a solution."""
-    rays = rig.camera.undistort(view.camera)
-    try:
-        success, rvec, tvec = cv2.solvePnP(view.points, rays[:, None], np.eye(3), None, flags=cv2.SOLVEPNP_ITERATIVE)
-    except cv2.error:
-        success = False
-    if not success:
+    T = solve_pose(view.points, rig.camera.undistort(view.camera), np.eye(3), np.zeros(5))
+    if T is None:
         raise InputError(f"{view.name}: no pose of the board fits its features: is it the calibration's board?")
-    return transform_from_rvec(rvec, tvec)
+    return T

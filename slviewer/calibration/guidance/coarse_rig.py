@@ -13,6 +13,7 @@ from slviewer.calibration.splined.fields import CELLS_ACROSS, RIDGE, Device, rou
 from slviewer.calibration.splined.prior import Prior
 from slviewer.calibration.splined.unknowns import Arrangement, State, UnknownLayout
 from slviewer.geometry.lens import Lens
+from slviewer.geometry.polynomial import grid_points
 from slviewer.geometry.rig import StereoRig
 from slviewer.geometry.rigid import Floats, move_points, nearest_rotation, rotation_angle, transform_from_rvec
 from slviewer.target.board import Board
@@ -78,8 +79,7 @@ class GuidanceModel:
     def points(self) -> np.ndarray:
         """(f, 3) mm: features that represent all those of the board."""
         low, high = self.board.points.min(0), self.board.points.max(0)
-        x, y = np.meshgrid(*(np.linspace(low[k], high[k], n) for k, n in enumerate(FEATURES)))
-        grid = np.column_stack([x.ravel(), y.ravel()])
+        grid = grid_points(*(np.linspace(low[k], high[k], n) for k, n in enumerate(FEATURES)))
         nearest = np.argmin(np.linalg.norm(self.board.points[None, :, :2] - grid[:, None], axis=2), axis=1)
         return np.ascontiguousarray(self.board.points[np.unique(nearest)])
 
@@ -111,8 +111,8 @@ class GuidanceModel:
         """
         outline = self.board.outline()
         shares = [(np.arange(n) + 0.5) / n for n in SAMPLES]
-        x, y = np.meshgrid(*(outline[0, k] + share * np.ptp(outline[:, k]) for k, share in enumerate(shares)))
-        pixels, visible = self._project(T_camera_board, np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)]), 0)
+        grid = grid_points(*(outline[0, k] + share * np.ptp(outline[:, k]) for k, share in enumerate(shares)))
+        pixels, visible = self._project(T_camera_board, np.pad(grid, ((0, 0), (0, 1))), 0)
         return [p[v] for p, v in zip(pixels, visible, strict=True)]
 
     def is_visible(self, T_camera_board: Floats) -> NDArray[np.bool_]:

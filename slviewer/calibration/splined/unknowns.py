@@ -147,9 +147,7 @@ class State:
 
 def pinhole_lens(device: Device) -> Lens:
     """Return the pinhole and Brown lens of a device, without its displacement field."""
-    fx, fy, cx, cy, *D = device.numbers[:LENS]
-    size = int(device.size[0]), int(device.size[1])
-    return Lens(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]), np.array(D), size)
+    return Lens.from_parameters(device.numbers[:LENS], (int(device.size[0]), int(device.size[1])))
 
 
 def rotate_left(R: Floats, vector: Floats) -> Floats:
