@@ -12,9 +12,10 @@ from slviewer.calibration.diagnosis.poses import FEW_POSES
 from slviewer.calibration.diagnosis.rules import HIGH_REPROJECTION_PX, MAX_FOCAL_UNCERTAINTY, MIN_TILT_DEG
 from slviewer.calibration.diagnosis.verdict import Finding, Verdict
 from slviewer.calibration.soundness import check_pose_count
-from slviewer.calibration.stereo import MAX_FOCAL_SIGMA, rms_length
+from slviewer.calibration.stereo import MAX_FOCAL_SIGMA
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.rigid import largest_angle_deg, move_points
+from slviewer.geometry.vectors import rms_length
 from slviewer.target.board import Board
 from slviewer.target.detect import Detection
 

@@ -16,6 +16,7 @@ from slviewer.errors import InputError
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.polynomial import grid_points
 from slviewer.geometry.rigid import move_points, rigid_transform
+from slviewer.geometry.vectors import finite_rows, lengths
 from slviewer.target.board import Board
 
 COLUMNS, ROWS = 4, 3
@@ -145,7 +146,7 @@ def suggest(
         new, existing = (
             _describe_numerically(np.reshape(each, (-1, 4, 4)), board, current.range_mm) for each in (candidates, poses)
         )
-        distance = np.linalg.norm(new[:, None] - existing, axis=-1).min(axis=1)
+        distance = lengths(new[:, None] - existing).min(axis=1)
     order = np.argsort(-(gain + 0.2 * distance), kind="stable")
     return describe_suggestion(board, lens, candidates[order[skip % len(order)]])
 
@@ -165,7 +166,7 @@ def projector_reach(
     Points are in the camera's frame. Returns a function points (k, 3) mm -> (k,) bool, or None where the points do not
     determine the projection, as on a single plane.
     """
-    known = np.isfinite(pixels).all(1) & np.isfinite(points).all(1)
+    known = finite_rows(pixels, points)
     points, pixels = points[known], pixels[known]
     if len(points) < 12:
         return None

@@ -21,6 +21,7 @@ from slviewer.fringe.sequence import Axis
 from slviewer.geometry.polynomial import Polynomial2D, fit_polynomial
 from slviewer.geometry.rigid import Floats
 from slviewer.geometry.splines import SplineSurface, fit_spline
+from slviewer.geometry.vectors import lengths
 from slviewer.target.board import Board
 from slviewer.target.detect import Detection, board_mask
 
@@ -267,11 +268,11 @@ def pitch_px(board: Board, detection: Detection) -> Floats:
     points = board.points[detection.ids][:, :2]
     H, _ = cv2.findHomography(points, np.asarray(detection.pixels, float))
     half = board.pitch_mm / 2
-    lengths = []
+    sides = []
     for step in (np.array([half, 0.0]), np.array([0.0, half])):
         ahead, behind = (cv2.perspectiveTransform((points + s)[None], H)[0] for s in (step, -step))
-        lengths.append(np.linalg.norm(ahead - behind, axis=1))
-    return np.minimum(*lengths)
+        sides.append(lengths(ahead - behind))
+    return np.minimum(*sides)
 
 
 def _projector_pixels(

@@ -13,6 +13,7 @@ from slviewer.calibration.splined.volume import in_illuminated_cells
 from slviewer.errors import InputError
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.polynomial import grid_points
+from slviewer.geometry.vectors import finite_rows, lengths, rms
 
 GRID = 80
 """Number of pixels across the image in the fit: several per cell of a displacement field."""
@@ -53,7 +54,7 @@ def fit_lens(pixels: np.ndarray, rays: np.ndarray, start: Lens) -> PinholeFit:
 
     ``start``: initial lens. Rows with NaN are ignored; raises InputError where fewer than 50 remain.
     """
-    known = np.isfinite(rays).all(axis=1) & np.isfinite(pixels).all(axis=1)
+    known = finite_rows(rays, pixels)
     if np.count_nonzero(known) < MIN_PIXELS:
         raise InputError(f"{np.count_nonzero(known)} pixels are calibrated: a lens needs at least {MIN_PIXELS}")
     observed, directions = pixels[known], rays[known]
@@ -71,13 +72,11 @@ def fit_lens(pixels: np.ndarray, rays: np.ndarray, start: Lens) -> PinholeFit:
 
 def _measure_residuals(lens: Lens, pixels: np.ndarray, rays: np.ndarray) -> PinholeFit:
     """Measure the residuals of a lens at pixels (n, 2) with known rays (n, 2); rows with NaN are ignored."""
-    length = np.linalg.norm(lens.distort(rays) - pixels, axis=1)
+    length = lengths(lens.distort(rays) - pixels)
     known = np.isfinite(length)
     if not known.any():
         return PinholeFit(lens, np.nan, np.nan, 0.0)
-    return PinholeFit(
-        lens, float(np.sqrt(np.mean(length[known] ** 2))), float(length[known].max()), float(known.mean())
-    )
+    return PinholeFit(lens, rms(length[known]), float(length[known].max()), float(known.mean()))
 
 
 def _fit_device(device: Device, illuminated: np.ndarray) -> PinholeFit:

@@ -10,6 +10,7 @@ from slviewer.calibration.observe import Observation
 from slviewer.errors import CalibrationRejected
 from slviewer.geometry.polynomial import fit_slopes
 from slviewer.geometry.rigid import largest_angle_deg
+from slviewer.geometry.vectors import unit_vectors
 
 MIN_POSES = 3
 MIN_TILT_SPREAD_DEG = 4.0
@@ -45,7 +46,7 @@ def nominal_tilt_spread_deg(used: Sequence[Observation]) -> float:
         H, _ = cv2.findHomography(o.points[:, :2], o.camera)
         line = np.linalg.inv(H).T @ np.array([0.0, 0.0, 1.0])
         normal = nominal_lens(o.size).K.T @ line
-        normals.append(normal / np.linalg.norm(normal) * np.sign(normal[2] or 1))
+        normals.append(unit_vectors(normal) * np.sign(normal[2] or 1))
     return largest_angle_deg(np.array(normals)) if len(normals) > 1 else 0.0
 
 

@@ -18,6 +18,7 @@ from slviewer.geometry.lens import Lens
 from slviewer.geometry.rig import StereoRig
 from slviewer.geometry.rigid import Floats, move_points, transform_from_rvec
 from slviewer.geometry.triangulation import depth_per_px, points_from_depth, triangulate
+from slviewer.geometry.vectors import finite_rows, rms_length
 from slviewer.records import from_plain, to_plain
 
 MIN_FEATURES = 12
@@ -136,7 +137,7 @@ def calibrate_stereo(
     excluded = dict(excluded or {})
     inliers: dict[str, NDArray[np.bool_]] = {}
     for observation in observations:
-        measured = np.isfinite(observation.projector).all(1) & np.isfinite(observation.camera).all(1)
+        measured = finite_rows(observation.projector, observation.camera)
         if len(observation.surfaces) < 2:
             only = ", ".join(observation.surfaces)
             excluded[observation.name] = f"holds the {only} axis alone: a calibration pose needs both x and y"
@@ -285,11 +286,6 @@ def _check_agreement(model: StereoModel) -> None:
         )
     if model.depth_range_mm is not None and model.depth_range_mm[0] <= 0:
         raise CalibrationRejected("the solution puts the board behind the camera: check the target's notation")
-
-
-def rms_length(residuals: np.ndarray) -> float:
-    """Return the root mean square length of 2-D residuals (n, 2), as OpenCV reports it; rows with NaN do not count."""
-    return float(np.sqrt(np.nanmean(np.sum(residuals**2, axis=1))))
 
 
 def _detect_outliers(

@@ -15,6 +15,7 @@ from slviewer.errors import InputError
 from slviewer.evaluation.fit import Fitted
 from slviewer.geometry.ransac import ransac_plane, ransac_sphere
 from slviewer.geometry.shapes import Plane, Sphere, fit_plane, fit_sphere
+from slviewer.geometry.vectors import finite_rows
 
 RANSAC_TOLERANCE_MM = 1.0  # or twice the noise
 PATCH_TOLERANCE_MM = 3.0  # or six times the noise
@@ -110,7 +111,7 @@ def measured_pixels(points: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
         raise InputError(f"The cloud has shape {points.shape}: an organised cloud (h, w, 3) is needed.")
     if mask is not None and mask.shape != points.shape[:2]:
         raise InputError(f"The mask has shape {mask.shape} and the cloud {points.shape[:2]}: they must agree.")
-    measured = np.isfinite(points).all(axis=2)
+    measured = finite_rows(points)
     measured = measured if mask is None else measured & mask
     if np.count_nonzero(measured) < LEAST_PIXELS:
         raise InputError(

@@ -8,6 +8,7 @@ from numpy.polynomial import chebyshev
 
 from slviewer.errors import InputError
 from slviewer.geometry.robust import fit_reweighted
+from slviewer.geometry.vectors import finite_rows
 
 Box = tuple[float, float, float, float]
 
@@ -87,7 +88,7 @@ def fit_slopes(inputs: np.ndarray, values: np.ndarray) -> np.ndarray:
 
     Rows with NaN do not count.
     """
-    known = np.isfinite(inputs).all(1) & np.isfinite(values).all(1)
+    known = finite_rows(inputs, values)
     design = np.column_stack([inputs[known], np.ones(np.count_nonzero(known))])
     return np.linalg.lstsq(design, values[known], rcond=None)[0][:-1]
 

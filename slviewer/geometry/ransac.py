@@ -7,6 +7,7 @@ from scipy.spatial import cKDTree
 
 from slviewer.errors import InputError
 from slviewer.geometry.shapes import Plane, Sphere, fit_plane, fit_sphere
+from slviewer.geometry.vectors import diagonal, finite_rows, lengths, unit_vectors
 
 SAMPLE_SIZE = 3000
 """Points of the subsample that hypotheses are drawn from and scored on."""
@@ -26,9 +27,9 @@ def ransac_plane(points: np.ndarray, tolerance: float, seed: int = 0) -> tuple[P
         """Return normals (k, 3) and offsets (k,) mm of the planes through point triples (k, 3, 3)."""
         a, b, c = triples[:, 0], triples[:, 1], triples[:, 2]
         normals = np.cross(b - a, c - a)
-        lengths = np.linalg.norm(normals, axis=1)
-        normals = normals[lengths > 0] / lengths[lengths > 0, None]
-        return normals, np.einsum("ij,ij->i", normals, a[lengths > 0])
+        regular = lengths(normals) > 0
+        normals = unit_vectors(normals[regular])
+        return normals, np.einsum("ij,ij->i", normals, a[regular])
 
     def distances(sample: np.ndarray, normal: np.ndarray, offset: np.ndarray) -> np.ndarray:
         """Return the signed distances (k, n) mm of the sample (n, 3) from each plane."""
@@ -45,18 +46,18 @@ def ransac_sphere(
     With ``radius`` (mm), only spheres of about that size are considered and the result has exactly that radius;
     without, spheres larger than the cloud are excluded, because any flat patch would fit one.
     """
-    finite = np.asarray(points, dtype=np.float64)[np.isfinite(points).all(axis=-1)]
-    extent = float(np.linalg.norm(np.ptp(finite, axis=0))) if len(finite) else 0.0
+    finite = np.asarray(points, dtype=np.float64)[finite_rows(points)]
+    extent = diagonal(finite) if len(finite) else 0.0
     low, high = (10.0 * tolerance, 0.5 * extent) if radius is None else (0.7 * radius, 1.4 * radius)
 
     def hypotheses(quads: np.ndarray) -> tuple[np.ndarray, ...]:
         """Return centres (k, 3) and radii (k,) mm of the spheres through four points each (k, 4, 3)."""
         origin = quads[:, :1]
         edges = quads[:, 1:] - origin
-        regular = np.abs(np.linalg.det(edges)) > 1e-12 * np.linalg.norm(edges, axis=2).prod(axis=1)
+        regular = np.abs(np.linalg.det(edges)) > 1e-12 * lengths(edges).prod(axis=1)
         edges, origin = edges[regular], origin[regular, 0]
         offset = np.linalg.solve(2.0 * edges, (edges**2).sum(axis=2)[..., None])[..., 0]
-        radii = np.linalg.norm(offset, axis=1)
+        radii = lengths(offset)
         sized = (radii >= low) & (radii <= high)
         return (origin + offset)[sized], radii[sized]
 
@@ -89,7 +90,7 @@ def _search(
 ) -> tuple:
     """Hypotheses from neighbours at many scales, scored by truncated squares (MSAC); the best few refined."""
     points = np.asarray(points, dtype=np.float64)
-    finite = np.isfinite(points).all(axis=-1)
+    finite = finite_rows(points)
     valid = points[finite]
     if len(valid) < 3 * needed:
         raise InputError(

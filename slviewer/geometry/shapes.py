@@ -6,6 +6,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from slviewer.errors import InputError
+from slviewer.geometry.vectors import finite_rows
 
 MIN_CAP_HEIGHT_RATIO = 4.0
 """A patch is fitted by a sphere only if its height over a plane is at least this many times the fit's RMS residual."""
@@ -86,7 +87,7 @@ def _select_finite(points: np.ndarray, least: int, what: str) -> tuple[np.ndarra
     points = np.asarray(points, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3:
         raise InputError(f"Points of shape {points.shape} were given for {what}: they must be (n, 3).")
-    finite = np.isfinite(points).all(axis=1)
+    finite = finite_rows(points)
     if finite.sum() < least:
         raise InputError(
             f"{finite.sum()} points were measured, and {what} needs {least} at least: select a wider region."

@@ -7,6 +7,7 @@ import numpy as np
 
 from slviewer.errors import InputError
 from slviewer.geometry.rigid import move_points, rigid_transform
+from slviewer.geometry.vectors import unit_vectors
 from slviewer.inspection.features import Feature
 from slviewer.inspection.fitting import FeatureFit
 from slviewer.inspection.uncertainty import RigidSpread, Spread
@@ -35,7 +36,7 @@ def datum_frame(features: Sequence[Feature]) -> np.ndarray:
     across = towards - (towards @ z) * z
     if not np.linalg.norm(across) > MIN_SINE * np.linalg.norm(towards):
         raise InputError("The secondary datum fixes no direction in the primary: choose another.")
-    x = across / np.linalg.norm(across)
+    x = unit_vectors(across)
     y = np.cross(z, x)
     # rows n and values n . p of the planes through the origin of the part
     if secondary.kind == "plane":

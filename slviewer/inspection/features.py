@@ -6,6 +6,7 @@ from typing import Literal
 import numpy as np
 
 from slviewer.errors import InputError
+from slviewer.geometry.vectors import lengths, unit_vectors
 
 Kind = Literal["point", "plane", "sphere", "cylinder"]
 KINDS: tuple[Kind, ...] = ("point", "plane", "sphere", "cylinder")
@@ -33,15 +34,14 @@ class Feature:
         offsets = np.asarray(points, np.float64) - self.place
         if self.kind == "plane":
             return offsets @ self.unit_direction
-        return np.linalg.norm(self._across(offsets), axis=-1) - (self.radius or 0.0)
+        return lengths(self._across(offsets)) - (self.radius or 0.0)
 
     def normals(self, points: np.ndarray) -> np.ndarray:
         """Return the unit vectors (n, 3) along which ``distance`` grows."""
         offsets = np.asarray(points, np.float64) - self.place
         if self.kind == "plane":
             return np.broadcast_to(self.unit_direction, offsets.shape)
-        across = self._across(offsets)
-        return across / np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-300)
+        return unit_vectors(self._across(offsets))
 
     def jacobian(self, points: np.ndarray) -> np.ndarray:
         """Return the derivatives (n, p) of ``distance`` of the points (n, 3) by the parameters."""
@@ -64,8 +64,7 @@ class Feature:
             radius = None if self.radius is None else self.radius + step[3]
             return replace(self, place=self.place + step[:3], radius=radius)
         e = self._tangents()
-        tilted = self.unit_direction + step[:2] @ e
-        tilted /= np.linalg.norm(tilted)
+        tilted = unit_vectors(self.unit_direction + step[:2] @ e)
         if self.kind == "plane":
             return replace(self, place=self.place + step[2] * self.unit_direction, direction=tilted)
         assert self.radius is not None
@@ -92,8 +91,7 @@ class Feature:
     def _tangents(self) -> np.ndarray:
         """Return two unit vectors (2, 3) perpendicular to the direction and to each other."""
         least = np.eye(3)[np.argmin(np.abs(self.unit_direction))]
-        first = _cross(self.unit_direction, least)
-        first /= np.linalg.norm(first)
+        first = unit_vectors(_cross(self.unit_direction, least))
         return np.stack([first, _cross(self.unit_direction, first)])
 
 

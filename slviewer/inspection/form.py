@@ -22,6 +22,7 @@ from scipy.stats import chi2
 from slviewer.errors import InputError
 from slviewer.geometry.cubes import occupied_cubes
 from slviewer.geometry.robust import robust_sigma
+from slviewer.geometry.vectors import finite_rows, unit_vectors
 from slviewer.inspection.features import Feature
 from slviewer.inspection.fitting import MAX_FITTED_POINTS, MAX_SHARED_POINTS, FeatureFit
 from slviewer.inspection.quantities import Quantity
@@ -177,12 +178,12 @@ def form_error(kind: FormKind, fit: FeatureFit, points: np.ndarray, shared: Shar
     wanted = {"flatness": ("plane",), "cylindricity": ("cylinder",), "roundness": ("sphere", "cylinder")}[kind]
     if f.kind not in wanted:
         raise InputError(f"A {f.kind} has no {kind}: choose a {' or a '.join(wanted)}.")
-    points = points[np.isfinite(points).all(axis=1)]
+    points = points[finite_rows(points)]
     if kind == "roundness":
         points, axis = _section_points(f, points)
         normals = f.normals(points)
         across = normals - (normals @ axis)[:, None] * axis
-        coordinates = across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-12)
+        coordinates = unit_vectors(across)
         fitted = np.column_stack([coordinates, np.ones(len(points))])  # a circle: a thin section shows no tilt
         first = coordinates[0]
         unrolled = np.arctan2(coordinates @ np.cross(axis, first), coordinates @ first)[:, None]
@@ -216,7 +217,7 @@ def orientation_error(
     tilt = float(np.degrees(np.arccos(min(cosine, 1.0)) if along else np.arcsin(min(cosine, 1.0))))
     if tilt > MAX_TILT_DEG:
         raise InputError(f"The {f.kind} is {tilt:.1f} degrees from the {kind} to the {d.kind}: choose another datum.")
-    points = points[np.isfinite(points).all(axis=1)]
+    points = points[finite_rows(points)]
     if f.kind == "cylinder":
         return _axis_orientation(kind, fit, points, datum, along)
 
@@ -226,7 +227,7 @@ def orientation_error(
         if along:
             return datum_direction * np.sign(datum_direction @ direction)
         across = direction - (direction @ datum_direction) * datum_direction
-        return across / np.linalg.norm(across)
+        return unit_vectors(across)
 
     normal = zone_normal(d.unit_direction)
     normals = np.broadcast_to(normal, points.shape)
@@ -253,7 +254,7 @@ def position_error(
     """
     if fit.feature.kind != nominal.kind:
         raise InputError(f"The feature is a {fit.feature.kind}, its nominal a {nominal.kind}: choose one kind.")
-    points = points[np.isfinite(points).all(axis=1)]
+    points = points[finite_rows(points)]
     f = fit.feature
     if f.direction is None:
         reached = np.zeros((1, 3))
@@ -274,9 +275,7 @@ def position_error(
         if feature.kind == "cylinder":
             ends = feature.place + (reached @ f.unit_direction)[:, None] * feature.unit_direction + moved
             offsets = ends - nominal.place
-            return 2 * float(
-                np.linalg.norm(offsets - (offsets @ normal_or_axis)[:, None] * normal_or_axis, axis=1).max()
-            )
+            return 2 * float(lengths(offsets - (offsets @ normal_or_axis)[:, None] * normal_or_axis).max())
         # the plane's points under the measured ones
         heights = reached - (reached @ feature.unit_direction)[:, None] * feature.unit_direction
         return 2 * float(np.abs((feature.place + heights + moved - nominal.place) @ normal_or_axis).max())
@@ -295,7 +294,7 @@ def profile_error(
 ) -> Quantity:
     """Profile of a surface, mm: twice the largest deviation (n,) mm of points (n, 3) from the nominal, whose normals
     (n, 3) are given; NaN for points that do not belong to it. Raises InputError for too few points."""
-    counted = np.isfinite(deviations) & np.isfinite(normals).all(axis=1)
+    counted = np.isfinite(deviations) & finite_rows(normals)
     points, deviations, normals = (np.asarray(each[counted], np.float64) for each in (points, deviations, normals))
     if not len(points):
         raise InputError("No point of the region belongs to the nominal: select a region on it.")
@@ -475,8 +474,7 @@ def _section_points(f: Feature, points: np.ndarray) -> tuple[np.ndarray, np.ndar
         middle, reach = (along.max() + along.min()) / 2, SECTION_SHARE * float(np.ptp(along)) / 2
         return points[np.abs(along - middle) <= reach], axis
     towards = points.mean(axis=0) - f.place
-    axis = np.cross(towards, np.eye(3)[np.argmin(np.abs(towards))])
-    axis /= np.linalg.norm(axis)
+    axis = unit_vectors(np.cross(towards, np.eye(3)[np.argmin(np.abs(towards))]))
     return points[np.abs((points - f.place) @ axis) <= SECTION_SHARE * (f.radius or 0.0)], axis
 
 

@@ -7,6 +7,7 @@ from scipy.spatial import cKDTree
 
 from slviewer.errors import InputError
 from slviewer.geometry.shapes import fit_plane, fit_sphere
+from slviewer.geometry.vectors import lengths, unit_vectors
 from slviewer.inspection.features import Feature, Kind
 
 SAMPLE = 1000
@@ -86,8 +87,7 @@ def _cylinder_through(sample: np.ndarray, normals: np.ndarray, rng: np.random.Ge
     if length < 0.05:
         return None
     axis /= length
-    u = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
-    u /= np.linalg.norm(u)
+    u = unit_vectors(np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))]))
     frame = np.stack([u, np.cross(axis, u)])
     flat = sample[[i, j, k]] @ frame.T
     offset = _offset_of_centre(flat, 1e-6)
@@ -100,7 +100,7 @@ def _offset_of_centre(points: np.ndarray, flattest: float) -> np.ndarray | None:
     """Return the centre (k,) of the sphere (circle) through points (k + 1, k), relative to the first; None for points
     that are flatter than the share ``flattest``."""
     edges = points[1:] - points[0]
-    if abs(np.linalg.det(edges)) <= flattest * np.linalg.norm(edges, axis=1).prod():
+    if abs(np.linalg.det(edges)) <= flattest * lengths(edges).prod():
         return None
     return np.linalg.solve(2.0 * edges, (edges**2).sum(axis=1))
 

@@ -11,6 +11,7 @@ from slviewer.calibration.splined.volume import BestMotion, Volume, view_pixels,
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.cubes import occupied_cubes
 from slviewer.geometry.polynomial import grid_points
+from slviewer.geometry.vectors import finite_rows
 
 Shared = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """Called with points (m, 3) and how p parameters answer to their displacement (p, m, 3): (k, p), whose product with
@@ -143,7 +144,7 @@ def _pixels(bundle: Bundle, points: np.ndarray) -> np.ndarray:
     # the rays of a coarse grid give a start that is linear in the normalised point
     grid = grid_points(np.linspace(0, width - 1, 9), np.linspace(0, height - 1, 7))
     rays = view_pixels(rig, grid, np.ones(len(grid)))[0]
-    known = np.isfinite(rays).all(axis=1)
+    known = finite_rows(rays)
     linear = np.linalg.lstsq(rays[known], grid[known], rcond=None)[0]
     pixels = points / points[:, 2:] @ linear
     for _ in range(6):

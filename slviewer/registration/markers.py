@@ -14,6 +14,7 @@ import numpy as np
 from slviewer.errors import InputError
 from slviewer.geometry.rigid import Floats, fit_rigid, move_points
 from slviewer.geometry.robust import robust_sigma, tukey_weights
+from slviewer.geometry.vectors import diagonal, lengths, rms_length
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.registration.refusal import Refused
 from slviewer.registration.uncertainty import Uncertainty
@@ -59,8 +60,7 @@ class MarkerPose:
     @property
     def rms_mm(self) -> float:
         """Root mean square distance of the corners."""
-        gap = move_points(self.T, self.scan_corners) - self.reference_corners
-        return float(np.sqrt(np.mean(np.sum(gap**2, axis=1))))
+        return rms_length(move_points(self.T, self.scan_corners) - self.reference_corners)
 
     def inverse(self) -> "MarkerPose":
         """The pose of the reference on the scan."""
@@ -115,7 +115,7 @@ def measure_markers(cloud: Cloud) -> MeasuredMarkers:
 def _measure_corner(cloud: Cloud, corner: np.ndarray, quad: np.ndarray) -> tuple[Floats, float] | None:
     """Return the point (3,) mm at a corner (2,) px of a marker ``quad`` (4, 2) px, and its standard deviation; None
     where too little of the surface around it was measured."""
-    reach = _FIT_REACH * float(np.linalg.norm(quad - np.roll(quad, 1, axis=0), axis=1).mean())
+    reach = _FIT_REACH * float(lengths(quad - np.roll(quad, 1, axis=0)).mean())
     height, width = cloud.points.shape[:2]
     (left, top), (right, bottom) = np.floor(corner - reach).astype(int), np.ceil(corner + reach).astype(int) + 1
     left, top, right, bottom = max(left, 0), max(top, 0), min(right, width), min(bottom, height)
@@ -208,13 +208,13 @@ def _select_steady(p: Floats, q: Floats, sigma: Floats) -> np.ndarray:
         steady = gap < limit
         if steady.sum() < 2:
             break
-    extent = float(np.linalg.norm(np.ptp(q.reshape(-1, 3), axis=0)))
+    extent = diagonal(q.reshape(-1, 3))
     return steady & (usual < max(MOVED_MM, MOST_GAP * extent))
 
 
 def _largest_gaps(T: Floats, p: Floats, q: Floats) -> Floats:
     """Return the largest gap (n,) mm of each marker's corners after a motion (4, 4)."""
-    return np.linalg.norm(move_points(T, p) - q, axis=2).max(axis=1)
+    return lengths(move_points(T, p) - q).max(axis=1)
 
 
 def marker_notes(measured: Mapping[str, MeasuredMarkers]) -> list[str]:

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from slviewer.errors import InputError
+from slviewer.geometry.vectors import rms
 from slviewer.registration.freedom import WORDS, Freedom, estimate_freedom
 from slviewer.registration.markers import MOVED_MM, MarkerPose
 from slviewer.registration.open3d_loader import align_icp, open3d
@@ -214,12 +215,12 @@ def _compute_figures(
     overlapping = distance < gate
     lateral = np.sqrt(np.maximum(distance**2 - height**2, 0.0))
     facing = lateral < spacing + 0.25 * height  # a point beyond the reference's rim faces nothing
-    rms = _rms(height[overlapping])
-    held = estimate_freedom(scan, reference, T, counterpart[overlapping], rms)
+    error = _rms(height[overlapping])
+    held = estimate_freedom(scan, reference, T, counterpart[overlapping], error)
     nowhere = Uncertainty(np.full((6, 6), np.inf), np.full(3, np.nan))
     figures = Registration(
         T_reference_scan=T,
-        rms_mm=rms,
+        rms_mm=error,
         inlier_rmse_mm=_rms(distance[overlapping]),
         overlap=float(overlapping.sum() / near.size),
         agreement=float((facing & (height < gate)).sum() / max(1, facing.sum())),
@@ -233,7 +234,7 @@ def _compute_figures(
 
 def _rms(values: np.ndarray) -> float:
     """Return the root mean square; NaN for an empty array."""
-    return float(np.sqrt(np.mean(np.square(values)))) if values.size else float("nan")
+    return rms(values) if values.size else float("nan")
 
 
 def _refuse_if_doubtful(result: Registration, held: Freedom | None, size: float) -> None:

@@ -8,6 +8,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from slviewer.errors import InputError
+from slviewer.geometry.vectors import lengths
 from slviewer.registration.open3d_loader import open3d
 
 LEAST_POINTS = 500
@@ -157,7 +158,7 @@ def _make_cloud(points: np.ndarray, normals: np.ndarray | None, voxel: float) ->
         finite = np.nan_to_num(np.asarray(normals, dtype=np.float64))  # a NaN normal weighs nothing in a voxel's mean
         cloud.normals = o3d.utility.Vector3dVector(finite)
         cloud = cloud.voxel_down_sample(voxel)
-        known = np.linalg.norm(np.asarray(cloud.normals), axis=1) > 0.1
+        known = lengths(np.asarray(cloud.normals)) > 0.1
         cloud = cloud.select_by_index(np.flatnonzero(known))
         cloud.normalize_normals()
     else:
@@ -165,5 +166,5 @@ def _make_cloud(points: np.ndarray, normals: np.ndarray | None, voxel: float) ->
         cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(30))
         cloud.orient_normals_towards_camera_location(np.zeros(3))
     seen = np.asarray(cloud.points)
-    facing = -np.sum(np.asarray(cloud.normals) * seen, axis=1) / np.linalg.norm(seen, axis=1)
+    facing = -np.sum(np.asarray(cloud.normals) * seen, axis=1) / lengths(seen)
     return cloud.select_by_index(np.flatnonzero(facing > _GRAZING))

@@ -13,6 +13,7 @@ import numpy as np
 from slviewer.geometry.cubes import occupied_cubes
 from slviewer.geometry.rigid import move_points, turn_about
 from slviewer.geometry.robust import robust_sigma, tukey_weights
+from slviewer.geometry.vectors import diagonal, rms_length
 from slviewer.registration.markers import MarkerPose
 from slviewer.registration.prepared import PreparedScan
 from slviewer.registration.uncertainty import Uncertainty
@@ -73,7 +74,7 @@ def refine_pose(
         step = -np.linalg.lstsq(H, gradient, rcond=1e-10)[0]
         T = turn_about(step[:3], centre, step[3:]) @ T
         next_gate = min(gate, max(3.0 * sigma, narrowest))
-        motion = np.linalg.norm(step[3:]) + np.linalg.norm(step[:3]) * np.linalg.norm(np.ptp(points, axis=0))
+        motion = np.linalg.norm(step[3:]) + np.linalg.norm(step[:3]) * diagonal(points)
         if next_gate > 0.99 * gate and motion < (_SETTLED_MM if stride == least else _NEAR_MM):
             if stride == least:
                 break
@@ -136,7 +137,7 @@ def _estimate_uncertainty(
     gradient = J * (weight * residual)[:, None]
     alike = _count_alike(points)
     H_markers = np.zeros((6, 6)) if markers is None else markers.normal_equations(T, centre, sigma * np.sqrt(alike))[0]
-    diameter = 2.0 * float(np.sqrt(np.mean(np.sum(arm**2, axis=1))))
+    diameter = 2.0 * rms_length(arm)
     largest = None
     for share in _PATCHES:
         patches = _sum_by_cube(gradient, arm, diameter / share)

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import binary_erosion
 
+from slviewer.geometry.vectors import lengths
 from slviewer.reconstruction.cloud import Cloud, choose_pixels
 from slviewer.reconstruction.reconstruct import normals as grid_normals
 
@@ -59,7 +60,7 @@ def away_from_edges(points: np.ndarray, sigma_z: np.ndarray | None = None) -> np
         first, second = (
             points[tuple(s if k == axis else slice(None) for k in (0, 1))] for s in (_BUT_LAST, _BUT_FIRST)
         )
-        pitch = np.linalg.norm((second - first)[..., :2], axis=-1)
+        pitch = lengths((second - first)[..., :2])
         known = pitch[np.isfinite(pitch)]
         if not known.size:
             continue

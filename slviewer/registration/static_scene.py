@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 
 from slviewer.errors import InputError
 from slviewer.geometry.rigid import move_points
+from slviewer.geometry.vectors import lengths
 from slviewer.reconstruction.cloud import Cloud, choose_pixels
 from slviewer.registration.multiway import MultiwayAlignment, Pair, Starts, register_all
 from slviewer.registration.open3d_loader import open3d
@@ -227,7 +228,7 @@ def sample_surface(points: np.ndarray) -> SurfaceSamples:
     cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(_NORMAL_POINTS))
     cloud.orient_normals_towards_camera_location(np.zeros(3))
     samples, normals = np.asarray(cloud.points), np.asarray(cloud.normals)
-    facing = -np.sum(samples * normals, axis=1) > _MIN_COSINE * np.linalg.norm(samples, axis=1)
+    facing = -np.sum(samples * normals, axis=1) > _MIN_COSINE * lengths(samples)
     facing &= samples[:, 2] > 0
     samples, normals = samples[facing], normals[facing]
     ray_tree, point_tree = cKDTree(samples[:, :2] / samples[:, 2:]), cKDTree(samples)

@@ -20,6 +20,7 @@ from slviewer.calibration.diagnosis.verdict import CAUSES, Cause, Finding, Sever
 from slviewer.calibration.observe import AXES
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.robust import robust_sigma
+from slviewer.geometry.vectors import unit_vectors
 
 MAX_SATURATED = 0.12
 REJECTED_SATURATED = 0.3
@@ -87,7 +88,7 @@ def diagnose_mirroring(e: Evidence) -> Iterator[Finding]:
     mirrored = {name: J for name, J in jacobians.items() if np.linalg.det(J) < 0}
     if len(mirrored) <= COMMON_SHARE * len(jacobians):
         return
-    mean = np.mean([J / np.linalg.norm(J, axis=1, keepdims=True) for J in mirrored.values()], axis=0)
+    mean = np.mean([unit_vectors(J) for J in mirrored.values()], axis=0)
     names = tuple(mirrored)
     observation = (
         f"in {len(mirrored)} of {len(jacobians)} poses the projector's coordinates are a mirror image of what the "

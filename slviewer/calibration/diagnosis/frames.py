@@ -12,6 +12,7 @@ from slviewer.fringe.reference import bit_heights, dark_limit, dark_sigmas, phas
 from slviewer.fringe.residual_sample import FEWEST, select_rows
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.geometry.polynomial import fit_slopes
+from slviewer.geometry.vectors import finite_rows, lengths
 
 ORIGIN_ROWS = 150
 """Image lines along which the Gray code's edges are located."""
@@ -174,7 +175,7 @@ def measure_motion_px(sequence: PatternSequence, stack: np.ndarray, pixels: np.n
         first, second, points, points.copy(), winSize=(window, window), maxLevel=levels
     )
     shift = (tracked - points).reshape(-1, 2)[np.asarray(status).ravel() > 0]
-    return float(np.median(np.linalg.norm(shift, axis=1))) if len(shift) >= 4 else np.nan
+    return float(np.median(lengths(shift))) if len(shift) >= 4 else np.nan
 
 
 def _scene_image(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -> np.ndarray | None:
@@ -201,7 +202,7 @@ def fit_mean_turn(camera: np.ndarray, projector: np.ndarray) -> tuple[tuple[floa
 
     Rows with NaN do not count; None for fewer than four others.
     """
-    known = np.isfinite(camera).all(1) & np.isfinite(projector).all(1)
+    known = finite_rows(camera, projector)
     if np.count_nonzero(known) < 4:
         return None
     (a, b), (c, d) = fit_slopes(camera, projector).T

@@ -15,6 +15,7 @@ from slviewer.calibration.stereo import StereoModel
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.polynomial import fit_polynomial, fit_slopes
 from slviewer.geometry.robust import robust_sigma
+from slviewer.geometry.vectors import finite_rows
 
 MAX_WAVES = 8
 """Largest number of waves per fringe period that is fitted."""
@@ -131,7 +132,7 @@ def _fit_ripple(samples: np.ndarray, mm_per_px: float, depth_mm: float) -> Rippl
     ``samples`` (n, 6): projector coordinate in periods, residual px, predicted noise px, and the three numbers of
     ``_measure_blocks``, by which the mean over a block attenuates each wave. Rows with NaN do not count.
     """
-    samples = samples[np.isfinite(samples).all(axis=1)]
+    samples = samples[finite_rows(samples)]
     if len(samples) < MIN_SAMPLES:
         return None
     periods, residual, sigma = samples.T[:3]

@@ -11,6 +11,7 @@ from slviewer.calibration.observe import Observation
 from slviewer.calibration.stereo import StereoModel
 from slviewer.geometry.polynomial import grid_points
 from slviewer.geometry.rigid import largest_angle_deg, move_points
+from slviewer.geometry.vectors import finite_rows
 
 CORNERS = {"top left": (0, 0), "top right": (1, 0), "bottom left": (0, 1), "bottom right": (1, 1)}
 CORNER_SHARE = (1 / 4, 1 / 3)
@@ -47,7 +48,7 @@ def measure_solution(observations: Sequence[Observation], stereo: StereoModel) -
 def measure_excluded(observation: Observation, stereo: StereoModel) -> ExcludedPose:
     """Measure the residuals of an excluded pose under the calibration; inf where its pose cannot be solved."""
     camera = stereo.rig.camera
-    detected = np.isfinite(observation.camera).all(1)
+    detected = finite_rows(observation.camera)
     T = None
     if np.count_nonzero(detected) >= 6:
         T = solve_pose(observation.points[detected], observation.camera[detected], camera.K, camera.D)

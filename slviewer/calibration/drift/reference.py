@@ -20,6 +20,7 @@ from slviewer.errors import InputError
 from slviewer.geometry.rig import StereoRig
 from slviewer.geometry.rigid import Floats
 from slviewer.geometry.robust import robust_sigma, tukey_weights
+from slviewer.geometry.vectors import rms
 
 MIN_POSES = 8
 """With fewer poses, the fields estimated without one pose do not represent those of a later view."""
@@ -161,7 +162,7 @@ def solve_change(
         gain[6:] @ e.scale,
         float(growth),
         float(samples[has_both_axes].mean()) if has_both_axes.any() else float("nan"),
-        float(np.sqrt(np.mean(unexplained**2))),
+        rms(unexplained),
     )
 
 

@@ -20,6 +20,7 @@ from slviewer.fringe.sequence import Axis
 from slviewer.geometry.rig import StereoRig
 from slviewer.geometry.rigid import Floats
 from slviewer.geometry.splines import cubic_basis
+from slviewer.geometry.vectors import unit_vectors
 
 SAMPLES = 1000
 """Number of pixels of the board at which the projector's coordinates are compared."""
@@ -176,8 +177,8 @@ def linearise_view(rig: StereoRig, view: DriftView) -> LinearView:
             ]
         )
     )
-    towards = np.stack([columns[3 + k][2 * n :].reshape(2, m).T for k in range(3)], 2) @ T[:3, 2]  # along the normal
-    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+    by_shift = np.stack([column[2 * n :].reshape(2, m).T for column in columns[3:6]], 2)
+    towards = unit_vectors(by_shift @ T[:3, 2])  # along the normal
     return LinearView(
         view.name,
         np.repeat([0, 1, 2], [2 * n, m, m]),

@@ -16,6 +16,7 @@ from slviewer.geometry.lens import Lens
 from slviewer.geometry.polynomial import grid_points
 from slviewer.geometry.rig import StereoRig
 from slviewer.geometry.rigid import Floats, move_points, nearest_rotation, rotation_angle, transform_from_rvec
+from slviewer.geometry.vectors import finite_rows, lengths
 from slviewer.target.board import Board
 
 COARSE_CELLS = 10
@@ -80,7 +81,7 @@ class GuidanceModel:
         """(f, 3) mm: features that represent all those of the board."""
         low, high = self.board.points.min(0), self.board.points.max(0)
         grid = grid_points(*(np.linspace(low[k], high[k], n) for k, n in enumerate(FEATURES)))
-        nearest = np.argmin(np.linalg.norm(self.board.points[None, :, :2] - grid[:, None], axis=2), axis=1)
+        nearest = np.argmin(lengths(self.board.points[None, :, :2] - grid[:, None]), axis=1)
         return np.ascontiguousarray(self.board.points[np.unique(nearest)])
 
     @cached_property
@@ -193,7 +194,7 @@ def estimate_rig(
     t = np.median(T[:, :3, 3], axis=0)
     R = nearest_rotation(np.median(T[:, :3, :3], axis=0))
     rotation = np.median(rotation_angle(T[:, :3, :3] @ R.T))
-    translation = np.median(np.linalg.norm(T[:, :3, 3] - t, axis=1)) / max(float(np.linalg.norm(t)), 1e-9)
+    translation = np.median(lengths(T[:, :3, 3] - t)) / max(float(np.linalg.norm(t)), 1e-9)
     is_behind = any(pose[2, 3] <= 0 for pose in poses[0])
     if rotation > MAX_DISAGREEMENT[0] or translation > MAX_DISAGREEMENT[1] or is_behind:
         return None
@@ -202,7 +203,7 @@ def estimate_rig(
 
 def _select_features(points: np.ndarray, camera: np.ndarray, projector: np.ndarray) -> list[NDArray[np.float32]]:
     """Return at most MAX_FEATURES of a pose's points and pixels (k, ...) float32, of those that both devices see."""
-    known = np.nonzero(np.isfinite(camera).all(1) & np.isfinite(projector).all(1))[0]
+    known = np.nonzero(finite_rows(camera, projector))[0]
     if len(known):
         known = known[np.unique(np.linspace(0, len(known) - 1, MAX_FEATURES).astype(int))]
     return [np.ascontiguousarray(each[known], np.float32) for each in (points, camera, projector)]

@@ -23,6 +23,7 @@ from slviewer.calibration.splined.residuals import HEIGHT, feature_row, sample_r
 from slviewer.calibration.splined.volume import Volume, remove_rigid_motion, select_depth_axis, working_volume
 from slviewer.geometry.jit import kernel
 from slviewer.geometry.rigid import Floats
+from slviewer.geometry.vectors import finite_rows
 
 NEGLIGIBLE = 1e-4
 """Share of the points' mean variance that gains neglect."""
@@ -44,7 +45,7 @@ class VolumeSensitivity:
         by_rig = compute_point_jacobian(
             model.state, select_depth_axis(model.rig, volume), volume.pixels, volume.z
         ).toarray()
-        known = np.isfinite(by_rig).all(axis=1).reshape(-1, 3).all(axis=1)
+        known = finite_rows(by_rig.reshape(len(volume.z), -1))
         volume = Volume(volume.pixels[known], volume.z[known], volume.points[known], volume.projector[known])
         by_rig = by_rig.reshape(len(known), 3, -1)[known].reshape(3 * len(volume.z), -1)
         jacobian = np.zeros((len(by_rig), model.layout.size))

@@ -11,6 +11,7 @@ from slviewer.calibration.guidance.coarse_rig import GuidanceModel
 from slviewer.calibration.guidance.information import RigInformation, VolumeSensitivity, information_rows
 from slviewer.calibration.next_pose import depth_range
 from slviewer.geometry.rigid import Floats, rigid_transform, rotation_angle
+from slviewer.geometry.vectors import lengths
 
 DEPTHS = (0.0, 0.2, 0.45, 0.75, 1.1, 1.45)
 """Candidate depths, from nearest (0) to farthest (1) recommended depth, and beyond it."""
@@ -106,5 +107,5 @@ def _select_extremes(places: Floats) -> list[int]:
 
 def _pose_distances(T: Floats, others: Floats) -> Floats:
     """Return distances (n,) of a pose (4, 4) to others (n, 4, 4): shift over 0.1 depth, plus turn over 15 degrees."""
-    translations = np.linalg.norm(T[:3, 3] - others[:, :3, 3], axis=1) / (0.1 * T[2, 3])
+    translations = lengths(T[:3, 3] - others[:, :3, 3]) / (0.1 * T[2, 3])
     return translations + rotation_angle(T[:3, :3].T @ others[:, :3, :3]) / np.radians(15)

@@ -22,6 +22,7 @@ from slviewer.errors import InputError
 from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.rig import StereoRig
+from slviewer.geometry.vectors import rms
 
 NEAR, FAR = 0.7, 1.4
 """Of the nearest and the farthest calibrated depth: between them points are measured."""
@@ -180,7 +181,7 @@ class SplinedModel:
         """Return the figures of ``text`` as plain values for JSON."""
         bundle = self.bundle
         fields = {
-            device: float(np.sqrt(np.mean(part.coefficients[:, 1:-1, 1:-1] ** 2)))
+            device: rms(part.coefficients[:, 1:-1, 1:-1])
             for device, part in (("camera", bundle.state.rig.camera), ("projector", bundle.state.rig.projector))
         }
         height = board_heights(bundle.points, board_frame(bundle.points), bundle.state.heights)
@@ -194,7 +195,7 @@ class SplinedModel:
             },
             "local_distortion_rms_px": fields,
             "board_height_mm": [float(height.min()), float(height.max())],
-            "board_offsets_rms_mm": float(np.sqrt(np.mean(bundle.state.offsets**2))),
+            "board_offsets_rms_mm": rms(bundle.state.offsets),
             "cells_lit": {
                 "camera": float(np.mean(bundle.camera_poses > 0)),
                 "projector": float(np.mean(bundle.projector_poses > 0)),

@@ -10,6 +10,7 @@ from slviewer.errors import InputError
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.jit import kernel
 from slviewer.geometry.rigid import Floats
+from slviewer.geometry.vectors import finite_rows, rms
 
 DEPTH_FACTORS = (0.87, 1.13)
 """Of the nearest and the farthest calibrated depth: in front of them (R1), inside (R2) and behind (R3), as the Letter
@@ -91,7 +92,7 @@ def in_illuminated_cells(device: Device, pixels: np.ndarray, illuminated: np.nda
     Pixels outside the image count to the cell at its edge; False for NaN.
     """
     shape = np.array([illuminated.shape[1], illuminated.shape[0]])
-    known = np.isfinite(pixels).all(axis=1)
+    known = finite_rows(pixels)
     place = np.where(known[:, None], (pixels + 0.5) / device.size * shape, 0.0)
     cells = np.clip(place, 0, shape - 1).astype(int)
     return illuminated[cells[:, 1], cells[:, 0]] & known
@@ -126,7 +127,7 @@ class BestMotion:
         if np.count_nonzero(chosen) < 3:
             raise InputError(f"{np.count_nonzero(chosen)} points were given: a rigid motion needs three")
         centre = points[chosen].mean(axis=0)
-        arm = max(float(np.sqrt(np.mean((points[chosen] - centre) ** 2))), 1e-12)
+        arm = max(rms(points[chosen] - centre), 1e-12)
         held = _motion_basis(points, centre, arm) * np.repeat(chosen, 3)[:, None]
         return cls(np.linalg.lstsq(held.T @ held, held.T, rcond=None)[0].T, centre, arm)
 

@@ -10,6 +10,7 @@ from slviewer.evaluation.acceptance.figures import AcceptanceFigure
 from slviewer.evaluation.incidence import incidence
 from slviewer.evaluation.plane import PlaneResult, evaluate_plane
 from slviewer.evaluation.sphere import SphereResult, evaluate_spheres
+from slviewer.geometry.vectors import unit_vectors
 from slviewer.reconstruction.cloud import Cloud
 
 FORM, SIZE, SPACING, FLATNESS = "probing error of form", "probing error of size", "sphere-spacing error", "flatness"
@@ -102,5 +103,5 @@ def _measure_balls(
 def _fit_covariance(points: np.ndarray, ball: SphereResult) -> np.ndarray:
     """(4, 4) mm^2 of centre and radius, from the scatter of the points about the sphere."""
     offsets = points[ball.inliers].astype(np.float64) - ball.sphere.centre
-    J = np.column_stack([offsets / np.linalg.norm(offsets, axis=1)[:, None], np.ones(len(offsets))])
+    J = np.column_stack([unit_vectors(offsets), np.ones(len(offsets))])
     return ball.rms_mm**2 * np.linalg.inv(J.T @ J)
