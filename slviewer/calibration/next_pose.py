@@ -10,19 +10,21 @@ from itertools import product
 
 import cv2
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from slviewer.calibration.board_pose import solve_pose
 from slviewer.errors import InputError
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.polynomial import grid_points
 from slviewer.geometry.rigid import move_points, rigid_transform
-from slviewer.geometry.vectors import finite_rows, lengths
+from slviewer.geometry.vectors import box_middle, finite_rows, lengths
 from slviewer.target.board import Board
 
 COLUMNS, ROWS = 4, 3
 """Cells of the image."""
 THIRDS = ("near", "at middle distance", "far")
 TILTS = ("facing", "top away", "right away", "bottom away", "left away")
+_TILT_AXES = ((0, 0), (-1, 0), (0, -1), (1, 0), (0, 1))  # about which the board is turned for each
 FACING_DEG = 8.0
 """Tilts below count as facing the camera."""
 GOAL_POSES = 2
@@ -37,6 +39,7 @@ _NEAR_FILL, _DEPTH_RATIO = (
     1.45,
 )  # nearest: the squarely held board fills so much of the image; farthest: times this
 _CELL_SHARE = 0.5  # of a cell that the board must cover
+_REACH_MARGIN = 0.02  # of the projector's image, inside which points are reached
 _FREE = 0.015  # of the image's width, left free around the board
 _FINE = 5  # samples along each side of a cell
 
@@ -159,7 +162,7 @@ def describe_suggestion(board: Board, lens: Lens, T_camera_board: np.ndarray) ->
 
 
 def projector_reach(
-    points: np.ndarray, pixels: np.ndarray, size: tuple[int, int], margin: float = 0.02
+    points: np.ndarray, pixels: np.ndarray, size: tuple[int, int]
 ) -> Callable[[np.ndarray], np.ndarray] | None:
     """Estimate the projector's field of view by linear resection (DLT) from points (n, 3) mm and pixels (n, 2).
 
@@ -184,7 +187,7 @@ def projector_reach(
     def reaches(points: np.ndarray) -> np.ndarray:
         """(k,) bool: whether points (k, 3) mm project into the projector's image less a margin."""
         h = np.column_stack([(points - middle) / scale, np.ones(len(points))]) @ P.T
-        return (np.abs(h[:, :2] / h[:, 2:]) < 0.5 - margin).all(1)
+        return (np.abs(h[:, :2] / h[:, 2:]) < 0.5 - _REACH_MARGIN).all(1)
 
     return reaches if reaches(points).mean() > 0.8 else None
 
@@ -202,14 +205,14 @@ def _list_candidates(
     """
     angle = np.radians((18.0, 25.0, 14.0)[count % 3])
     near, far = span
-    middle = (board.points.min(0) + board.points.max(0)) / 2
+    middle = box_middle(board.points)
     # Before two poses have shown the projector's field of view, the middle of the image is most likely inside it.
     places = np.array(list(product((-1, 0, 1), repeat=2)) if illuminated is not None else [(0, 0)])
     shares = np.linspace(1, 0, 11)  # of the way from the image's middle to its border
     pixels = (np.array(lens.size) - 1) / 2 + shares[:, None] * (places * np.array(lens.size) / 2)[:, None]
     rays = np.concatenate([(pixels - lens.K[:2, 2]) / np.diag(lens.K)[:2], np.ones((*pixels.shape[:2], 1))], axis=-1)
     depths = near + (far - near) * (np.arange(3) + 0.5) / 3
-    R = np.array([_tilt_rotation(tilt, angle) for tilt in range(len(TILTS))])
+    R = Rotation.from_rotvec([(angle * x, angle * y, 0.0) for x, y in _TILT_AXES]).as_matrix()
     t = depths[:, None, None, None, None] * rays - (R @ middle)[:, None, None]
     T = rigid_transform(np.broadcast_to(R[:, None, None], (*t.shape, 3)), t)  # by depth, tilt, place and share
     visible = _is_visible(board, lens, T.reshape(-1, 4, 4), illuminated).reshape(t.shape[:-1])
@@ -258,12 +261,6 @@ def _classify_tilt(T: np.ndarray) -> np.ndarray:
     return np.where(facing, 0, tilted)
 
 
-def _tilt_rotation(tilt: int, angle: float) -> np.ndarray:
-    """Return the rotation (3, 3) of a tilt, by its index in `TILTS`, with an angle in rad."""
-    x, y = {0: (0, 0), 1: (-angle, 0), 2: (0, -angle), 3: (angle, 0), 4: (0, angle)}[tilt]
-    return cv2.Rodrigues(np.array([x, y, 0.0]))[0]
-
-
 def _describe_numerically(T: np.ndarray, board: Board, span: tuple[float, float]) -> np.ndarray:
     """Return descriptors (n, 5) of poses (n, 4, 4), to compare them: position, depth and tilt in units of about 1."""
     middle = _board_middle(T, board)
@@ -274,21 +271,13 @@ def _describe_numerically(T: np.ndarray, board: Board, span: tuple[float, float]
 
 def _board_middle(T: np.ndarray, board: Board) -> np.ndarray:
     """Return the middle (n, 3) mm of the board's features at poses (n, 4, 4), in the camera's frame."""
-    return move_points(T, ((board.points.min(0) + board.points.max(0)) / 2)[None])[:, 0]
+    return move_points(T, box_middle(board.points)[None])[:, 0]
 
 
 def _describe_pose(third: int, tilt: int, middle_px: np.ndarray, size: tuple[int, int]) -> str:
     """Return the instruction for a pose: its tilt, depth and position in the image in words."""
     across, down = middle_px / np.array(size) - 0.5
-    where = [
-        word
-        for word, here in (
-            ("top", down < -0.06),
-            ("bottom", down > 0.06),
-            ("left", across < -0.06),
-            ("right", across > 0.06),
-        )
-        if here
-    ]
+    words = {"top": down < -0.06, "bottom": down > 0.06, "left": across < -0.06, "right": across > 0.06}
+    where = " ".join(word for word, here in words.items() if here)
     attitude = "Face the camera squarely" if tilt == 0 else f"Tilt the {TILTS[tilt].removesuffix(' away')} away"
-    return f"{attitude}, {THIRDS[third]}, {'to the ' + ' '.join(where) if where else 'in the middle'}"
+    return f"{attitude}, {THIRDS[third]}, {f'to the {where}' if where else 'in the middle'}"

@@ -197,8 +197,8 @@ class Observation:
             (left, top, right, bottom),
             arrays["region"],
             arrays.get("slopes"),
-            float(arrays["radius_mm"]) if "radius_mm" in arrays else 0.0,
-            bool(arrays["marked"]) if "marked" in arrays else False,
+            float(arrays.get("radius_mm", 0.0)),
+            bool(arrays.get("marked", False)),
             Samples(*(arrays[f"samples_{name}"] for name in Samples.__annotations__))
             if "samples_camera" in arrays
             else None,

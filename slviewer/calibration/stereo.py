@@ -18,7 +18,7 @@ from slviewer.geometry.lens import Lens
 from slviewer.geometry.rig import StereoRig
 from slviewer.geometry.rigid import Floats, move_points, transform_from_rvec
 from slviewer.geometry.triangulation import depth_per_px, points_from_depth, triangulate
-from slviewer.geometry.vectors import finite_rows, rms_length
+from slviewer.geometry.vectors import finite_rows, lengths, rms_length
 from slviewer.records import from_plain, to_plain
 
 MIN_FEATURES = 12
@@ -181,7 +181,7 @@ class _Solution:
     """Result of ``cv2.stereoCalibrate``: the rig, T_camera_board (4, 4) mm of each pose, focal sigmas by device."""
 
     rig: StereoRig
-    poses: list[Floats]
+    poses: dict[str, Floats]
     focal_sigma_px: dict[str, float]
 
     @classmethod
@@ -236,12 +236,12 @@ class _Solution:
                 )
         camera = Lens(np.array(K_c), np.array(D_c).ravel()[:5], used[0].size)
         projector = Lens(np.array(K_p), np.array(D_p).ravel()[:5], projector_size)
-        poses = [transform_from_rvec(rvec, tvec) for rvec, tvec in zip(rvecs, tvecs, strict=True)]
+        poses = {o.name: transform_from_rvec(r, t) for o, r, t in zip(used, rvecs, tvecs, strict=True)}
         return cls(StereoRig(camera, projector, np.array(R), np.array(T)), poses, sigma)
 
-    def residuals(self, index: int, observation: Observation) -> Floats:
+    def residuals(self, observation: Observation) -> Floats:
         """Return the camera and projector residuals (n, 4) px of every feature of one pose."""
-        X = move_points(self.poses[index], observation.points)
+        X = move_points(self.poses[observation.name], observation.points)
         predicted = self.rig.camera.project(X), self.rig.project(X)
         return np.hstack([observation.camera - predicted[0], observation.projector - predicted[1]])
 
@@ -253,10 +253,8 @@ class _Solution:
         excluded: Mapping[str, str],
     ) -> StereoModel:
         """Return the calibrated model with the reprojection errors of the inlier features."""
-        residuals = {
-            o.name: np.where(inliers[o.name][:, None], self.residuals(i, o), np.nan) for i, o in enumerate(used)
-        }
-        z = np.concatenate([move_points(T, o.points)[:, 2] for T, o in zip(self.poses, used, strict=True)])
+        residuals = {o.name: np.where(inliers[o.name][:, None], self.residuals(o), np.nan) for o in used}
+        z = np.concatenate([move_points(self.poses[o.name], o.points)[:, 2] for o in used])
         all_residuals = np.concatenate(list(residuals.values()))
         rms = {"camera": rms_length(all_residuals[:, :2]), "projector": rms_length(all_residuals[:, 2:])}
         rms["stereo"] = float(np.sqrt((rms["camera"] ** 2 + rms["projector"] ** 2) / 2))
@@ -265,7 +263,7 @@ class _Solution:
             board=board,
             axes=("x", "y"),
             reprojection_rms_px=rms,
-            poses={o.name: T for o, T in zip(used, self.poses, strict=True)},
+            poses=self.poses,
             pose_rms_px={name: (rms_length(r[:, :2]), rms_length(r[:, 2:])) for name, r in residuals.items()},
             excluded=excluded,
             depth_range_mm=(float(z.min()), float(z.max())),
@@ -295,11 +293,8 @@ def _detect_outliers(
 
     An outlier's residual exceeds ROBUST_SIGMAS times the robust sigma of all features, in either device.
     """
-    lengths = {}
-    for i, o in enumerate(used):
-        r = solution.residuals(i, o)
-        lengths[o.name] = np.stack([np.hypot(r[:, 0], r[:, 1]), np.hypot(r[:, 2], r[:, 3])], axis=1)
-    sigma = np.median(np.concatenate([lengths[o.name][inliers[o.name]] for o in used]), axis=0) / 1.1774  # Rayleigh
+    errors = {o.name: lengths(solution.residuals(o).reshape(-1, 2, 2)) for o in used}  # in the camera and projector
+    sigma = np.median(np.concatenate([errors[o.name][inliers[o.name]] for o in used]), axis=0) / 1.1774  # Rayleigh
     limit = np.maximum(ROBUST_SIGMAS * sigma, 0.05)
-    outliers = {o.name: inliers[o.name] & (lengths[o.name] > limit).any(1) for o in used}
+    outliers = {o.name: inliers[o.name] & (errors[o.name] > limit).any(1) for o in used}
     return {name: is_outlier for name, is_outlier in outliers.items() if is_outlier.any()}

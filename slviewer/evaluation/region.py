@@ -26,21 +26,17 @@ _SAMPLE = 40_000
 
 
 def find_plane(
-    points: np.ndarray,
-    mask: np.ndarray | None = None,
-    sigma_z: np.ndarray | None = None,
-    start: Plane | None = None,
+    points: np.ndarray, sigma_z: np.ndarray | None = None, start: Plane | None = None
 ) -> tuple[Plane, np.ndarray]:
     """Detect the plane with most pixels of a cloud ``(h, w, 3)``, and its region ``(h, w)`` bool.
 
-    ``mask`` leaves only some pixels to search in; ``sigma_z`` ``(h, w)`` mm is the expected noise. The region is one
-    patch without its outermost two pixels; isolated pixels and small holes inside it belong to it, whether something
-    was measured there or not. A roughly known plane to ``start`` from spares the search. The plane that comes back is a
-    start for fits, not a result. Raises ``InputError`` where no plane fills a patch.
+    ``sigma_z`` ``(h, w)`` mm is the expected noise. The region is one patch without its outermost two pixels; isolated
+    pixels and small holes inside it belong to it, whether something was measured there or not. A roughly known plane to
+    ``start`` from spares the search. The plane that comes back is a start for fits, not a result. Raises ``InputError``
+    where no plane fills a patch.
     """
-    measured = measured_pixels(points, mask)
-    noise = _typical_noise(sigma_z, measured)
-    reach = max(PATCH_TOLERANCE_MM, 6.0 * noise)
+    measured = measured_pixels(points, None)
+    reach = max(PATCH_TOLERANCE_MM, 6.0 * _typical_noise(sigma_z, measured))
     first = start or start_plane(points, measured, sigma_z)
     return _grow_patch(points, measured, first, fit_plane, lambda shape: reach, "flat")
 
@@ -80,9 +76,8 @@ def find_spheres(
 def start_plane(points: np.ndarray, mask: np.ndarray, sigma_z: np.ndarray | None = None) -> Plane:
     """Estimate the plane that most points under ``mask`` agree with, by RANSAC."""
     measured = measured_pixels(points, mask)
-    return ransac_plane(
-        sample_points(points, measured), max(RANSAC_TOLERANCE_MM, 2.0 * _typical_noise(sigma_z, measured))
-    )[0]
+    tolerance = max(RANSAC_TOLERANCE_MM, 2.0 * _typical_noise(sigma_z, measured))
+    return ransac_plane(sample_points(points, measured), tolerance)[0]
 
 
 def start_sphere(

@@ -16,11 +16,11 @@ REFINED_HYPOTHESES = 12
 """How many of the best hypotheses are refined by least squares before the best is chosen."""
 
 
-def ransac_plane(points: np.ndarray, tolerance: float, seed: int = 0) -> tuple[Plane, np.ndarray]:
+def ransac_plane(points: np.ndarray, tolerance: float) -> tuple[Plane, np.ndarray]:
     """The plane with most inliers among points (n, 3), to ``tolerance`` mm, and its inlier mask (n,) bool.
 
-    Draws from a subsample and ends with least squares over all inliers; deterministic for a given seed. NaN rows are
-    excluded. Raises InputError where no plane is detected.
+    Draws from a subsample and ends with least squares over all inliers; deterministic. NaN rows are excluded.
+    Raises InputError where no plane is detected.
     """
 
     def hypotheses(triples: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -35,12 +35,10 @@ def ransac_plane(points: np.ndarray, tolerance: float, seed: int = 0) -> tuple[P
         """Return the signed distances (k, n) mm of the sample (n, 3) from each plane."""
         return normal @ sample.T - offset[:, None]
 
-    return _search(points, 3, tolerance, seed, hypotheses, distances, fit_plane, "plane")
+    return _search(points, 3, tolerance, hypotheses, distances, fit_plane, "plane")
 
 
-def ransac_sphere(
-    points: np.ndarray, tolerance: float, radius: float | None = None, seed: int = 0
-) -> tuple[Sphere, np.ndarray]:
+def ransac_sphere(points: np.ndarray, tolerance: float, radius: float | None = None) -> tuple[Sphere, np.ndarray]:
     """The sphere with most inliers among points (n, 3), to ``tolerance`` mm, and its inlier mask (n,) bool.
 
     With ``radius`` (mm), only spheres of about that size are considered and the result has exactly that radius;
@@ -75,14 +73,13 @@ def ransac_sphere(
             raise InputError(f"The detected sphere has a radius of {sphere.radius:.1f} mm, too large for its cloud.")
         return sphere
 
-    return _search(points, 4, tolerance, seed, hypotheses, distances, fit, "sphere")
+    return _search(points, 4, tolerance, hypotheses, distances, fit, "sphere")
 
 
 def _search(
     points: np.ndarray,
     needed: int,
     tolerance: float,
-    seed: int,
     hypotheses: Callable[[np.ndarray], tuple[np.ndarray, ...]],
     distances: Callable[..., np.ndarray],
     fit: Callable,
@@ -96,7 +93,7 @@ def _search(
         raise InputError(
             f"{len(valid)} points were measured, too few to detect a {what}: check the capture's exposure."
         )
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     sample = valid[rng.choice(len(valid), min(SAMPLE_SIZE, len(valid)), replace=False)]
     parameters = hypotheses(_minimal_sets(sample, needed, rng))
     # score in slices, so that the table of distances stays small

@@ -122,15 +122,19 @@ def cubic_basis(positions: np.ndarray, start: float, end: float, cells: int) -> 
     return cell, weights
 
 
+def second_differences(count: int) -> sp.dia_array:
+    """Return the second differences (count - 2, count) of so many coefficients."""
+    return sp.diags([1.0, -2.0, 1.0], [0, 1, 2], shape=(count - 2, count))
+
+
 def bending_energy(columns: int, rows: int) -> sp.sparray:
     """Return the quadratic form d_uu^2 + 2 d_uv^2 + d_vv^2 of coefficients (rows, columns), as of a thin plate.
 
     It is a sparse matrix (rows columns, rows columns) of first and second differences.
     """
     first = [sp.diags([-1.0, 1.0], [0, 1], shape=(n - 1, n)) for n in (columns, rows)]
-    second = [sp.diags([1.0, -2.0, 1.0], [0, 1, 2], shape=(n - 2, n)) for n in (columns, rows)]
-    uu = sp.kron(sp.eye(rows), second[0])
-    vv = sp.kron(second[1], sp.eye(columns))
+    uu = sp.kron(sp.eye(rows), second_differences(columns))
+    vv = sp.kron(second_differences(rows), sp.eye(columns))
     uv = sp.kron(first[1], first[0])
     return uu.T @ uu + 2.0 * uv.T @ uv + vv.T @ vv
 

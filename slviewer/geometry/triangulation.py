@@ -8,7 +8,7 @@ import numpy as np
 
 from slviewer.errors import InputError
 from slviewer.geometry.brown import distort_point
-from slviewer.geometry.jit import kernel
+from slviewer.geometry.jit import kernel, read_only
 from slviewer.geometry.rig import StereoRig
 
 TOLERANCE_PX = 1e-7
@@ -116,9 +116,17 @@ def _check_map(rig: StereoRig, values: np.ndarray, what: str) -> None:
 
 def _as_read_only(values: np.ndarray) -> np.ndarray:
     """Convert to read-only contiguous float64: one array type for the kernels, so that they compile once."""
-    view = np.ascontiguousarray(values, dtype=np.float64).view()
-    view.setflags(write=False)
-    return view
+    return read_only(np.ascontiguousarray(values, dtype=np.float64))
+
+
+@kernel()
+def _rotate_ray(R, uc, vc):
+    """Return the ray (uc, vc, 1) rotated by R."""
+    return (
+        R[0, 0] * uc + R[0, 1] * vc + R[0, 2],
+        R[1, 0] * uc + R[1, 1] * vc + R[1, 2],
+        R[2, 0] * uc + R[2, 1] * vc + R[2, 2],
+    )
 
 
 @kernel()
@@ -150,9 +158,7 @@ def ray_depth(uc, vc, measured, shift, R, t, parameters, row, extent):
 
     ``shift``: initial value of the second.
     """
-    a0 = R[0, 0] * uc + R[0, 1] * vc + R[0, 2]
-    a1 = R[1, 0] * uc + R[1, 1] * vc + R[1, 2]
-    a2 = R[2, 0] * uc + R[2, 1] * vc + R[2, 2]
+    a0, a1, a2 = _rotate_ray(R, uc, vc)
     a = a0 if row == 0 else a1
     reading = (measured - parameters[2 + row]) / parameters[row]
     up = reading + shift
@@ -206,8 +212,5 @@ def _triangulate_all(rays, coordinate, R, t, parameters, row, extent, z):
 def _coordinate_slopes(rays, depths, R, t, parameters, row, slopes):
     """Fill ``slopes`` (n,) with d(projector coordinate)/dz in px per mm of rays (n, 2) at depths (n,) mm."""
     for i in numba.prange(depths.shape[0]):
-        uc, vc = rays[i, 0], rays[i, 1]
-        a0 = R[0, 0] * uc + R[0, 1] * vc + R[0, 2]
-        a1 = R[1, 0] * uc + R[1, 1] * vc + R[1, 2]
-        a2 = R[2, 0] * uc + R[2, 1] * vc + R[2, 2]
+        a0, a1, a2 = _rotate_ray(R, rays[i, 0], rays[i, 1])
         _, _, slopes[i], _, _ = _projection(depths[i], a0, a1, a2, t, parameters, row)

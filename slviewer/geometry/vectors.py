@@ -19,6 +19,11 @@ def diagonal(points: np.ndarray) -> float:
     return float(np.linalg.norm(np.ptp(points, axis=0)))
 
 
+def box_middle(points: np.ndarray) -> np.ndarray:
+    """Return the middle (k,) of the box around points (n, k)."""
+    return (points.min(axis=0) + points.max(axis=0)) / 2
+
+
 def rms(values: ArrayLike) -> float:
     """Return the root mean square of values."""
     return float(np.sqrt(np.mean(np.square(values))))

@@ -119,11 +119,9 @@ def fit_feature(kind: Kind, points: np.ndarray, shared: Shared | None = None, ca
             f"{100 * excluded_share:.1f} % of the region lie beyond {SET_ASIDE_SIGMA:g} robust sigma "
             f"of the {kind} and were excluded: see that it shows nothing else"
         )
-    farthest = float(residuals[counted][np.argmax(np.abs(residuals[counted]))])
-    form = narrowest_range(residuals[counted], 0.95)
-    return FeatureFit(
-        feature, spread, rms(residuals[counted]), farthest, form, used, len(points) - used, tuple(warnings)
-    )
+    fitted = residuals[counted]
+    farthest, form = float(fitted[np.argmax(np.abs(fitted))]), narrowest_range(fitted, 0.95)
+    return FeatureFit(feature, spread, rms(fitted), farthest, form, used, len(points) - used, tuple(warnings))
 
 
 def least_squares(kind: Kind, points: np.ndarray, start: Feature | None) -> Feature:

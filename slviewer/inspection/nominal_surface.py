@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from slviewer.errors import InputError
-from slviewer.geometry.vectors import diagonal, lengths, unit_vectors
+from slviewer.geometry.vectors import box_middle, diagonal, lengths, unit_vectors
 from slviewer.registration.open3d_loader import open3d
 from slviewer.surface.shapes import Mesh
 from slviewer.surface.topology import half_edges
@@ -27,7 +27,7 @@ class NominalSurface:
         if not len(mesh.faces):
             raise InputError("The nominal model has no triangles: give a mesh.")
         vertices = mesh.vertices.astype(np.float64)
-        self.middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2  # casting in float32 is finest about 0
+        self.middle = box_middle(vertices)  # casting in float32 is finest about 0
         self.diagonal = diagonal(vertices)
         self._mesh: Any = trimesh.Trimesh(vertices - self.middle, mesh.faces, process=False)
         if not self._mesh.area > 0:

@@ -77,7 +77,7 @@ def pose_distance(points: np.ndarray, T: np.ndarray, other: np.ndarray) -> float
 def _score_pose(scan: Any, reference: Any, tree: cKDTree, T: np.ndarray, voxel: float) -> float:
     """Return the share of the scan that overlaps the reference, times the share of agreement where the two face each
     other."""
-    points = np.asarray(scan.points) @ T[:3, :3].T + T[:3, 3]
+    points = move_points(T, np.asarray(scan.points))
     normals = np.asarray(scan.normals) @ T[:3, :3].T
     distance, nearest = tree.query(points, distance_upper_bound=3.0 * voxel)
     near = np.isfinite(distance)

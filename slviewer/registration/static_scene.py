@@ -18,7 +18,7 @@ from slviewer.reconstruction.cloud import Cloud, choose_pixels
 from slviewer.registration.multiway import MultiwayAlignment, Pair, Starts, register_all
 from slviewer.registration.open3d_loader import open3d
 from slviewer.registration.pairwise import Progress
-from slviewer.registration.prepared import LEAST_POINTS, sort_spatially
+from slviewer.registration.prepared import LEAST_POINTS, measure_size, sort_spatially
 from slviewer.registration.refusal import Refused
 
 SIGMAS = 5.0
@@ -221,9 +221,8 @@ def sample_surface(points: np.ndarray) -> SurfaceSamples:
     """Downsample the measured points (n, 3) mm of a scan in its camera's frame; grazing samples are removed."""
     o3d = open3d()
     points = np.asarray(points, np.float64)
-    low, high = np.percentile(points[:: max(1, len(points) // 100_000)], (1.0, 99.0), axis=0)
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
-    cloud = cloud.voxel_down_sample(float((high - low).max()) / _SAMPLES_PER_SIDE)
+    cloud = cloud.voxel_down_sample(measure_size(points) / _SAMPLES_PER_SIDE)
     cloud = sort_spatially(cloud)
     cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(_NORMAL_POINTS))
     cloud.orient_normals_towards_camera_location(np.zeros(3))

@@ -19,7 +19,7 @@ from slviewer.errors import InputError
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.rig import StereoRig
 from slviewer.geometry.rigid import Floats
-from slviewer.geometry.splines import cubic_basis
+from slviewer.geometry.splines import cubic_basis, second_differences
 from slviewer.geometry.vectors import unit_vectors
 
 SAMPLES = 1000
@@ -99,11 +99,7 @@ class DisplacementField:
         """Quadratic form (unknowns, unknowns) of the squared second differences of one component's coefficients."""
         across, down = (n + 3 for n in self.cells)
 
-        def difference(n: int) -> sp.csr_array:
-            """Return the second differences (n - 2, n) of n coefficients."""
-            return sp.csr_array(sp.diags([1.0, -2.0, 1.0], [0, 1, 2], shape=(n - 2, n)))
-
-        u, v = sp.kron(sp.eye(down), difference(across)), sp.kron(difference(down), sp.eye(across))
+        u, v = sp.kron(sp.eye(down), second_differences(across)), sp.kron(second_differences(down), sp.eye(across))
         return sp.csr_array(u.T @ u + v.T @ v)
 
 
@@ -165,18 +161,9 @@ def linearise_view(rig: StereoRig, view: DriftView) -> LinearView:
         """Return the derivatives of a projector coordinate by the camera's field, u and v components."""
         return [-sp.csr_array(sp.diags(np.nan_to_num(J[:, row, k])) @ at_pixels) for k in (0, 1)]
 
-    nothing = sp.csr_array((n, projector.unknowns)), sp.csr_array((m, projector.unknowns))
     interleaved = [sp.csr_array(sp.kron(on_features, np.eye(2)[:, k : k + 1])) for k in (0, 1)]
-    twice = sp.csr_array((2 * n, projector.unknowns))
-    shared = sp.csr_array(
-        sp.vstack(
-            [
-                sp.hstack([*interleaved, twice, twice]),
-                sp.hstack([*moved_by(0), on_samples, nothing[1]]),
-                sp.hstack([*moved_by(1), nothing[1], on_samples]),
-            ]
-        )
-    )
+    rows = [*interleaved, None, None], [*moved_by(0), on_samples, None], [*moved_by(1), None, on_samples]
+    shared = sp.block_array(rows, format="csr")
     by_shift = np.stack([column[2 * n :].reshape(2, m).T for column in columns[3:6]], 2)
     towards = unit_vectors(by_shift @ T[:3, 2])  # along the normal
     return LinearView(

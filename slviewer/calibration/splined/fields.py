@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy.sparse as sp
 
-from slviewer.geometry.brown import distort_point, undistort_point
+from slviewer.geometry.brown import distort_to_px, undistort_point
 from slviewer.geometry.jit import kernel
 from slviewer.geometry.splines import bending_energy
 
@@ -121,11 +121,9 @@ def remove_displacement(device, u, v, basis):
 @kernel()
 def distort_to_pixel(device, x, y, basis):
     """The pixel of an undistorted normalised point, without derivatives; NaN past the fold of Brown's polynomial."""
-    k = device.numbers
-    if not x * x + y * y < k[9]:
-        return np.nan, np.nan
-    xd, yd, _, _, _ = distort_point(x, y, k)
-    u, v = k[0] * xd + k[2], k[1] * yd + k[3]
+    u, v = distort_to_px(x, y, device.numbers)
+    if np.isnan(u):
+        return u, v
     du, dv, _, _, _, _, _, _ = displacement(device, u, v, basis)
     return u + du, v + dv
 

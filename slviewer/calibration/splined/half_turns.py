@@ -13,7 +13,7 @@ from slviewer.calibration.splined.normal import PoseData, predict_observations
 from slviewer.calibration.splined.unknowns import State
 from slviewer.errors import InputError
 from slviewer.geometry.polynomial import monomials, scale_to_unit_square
-from slviewer.geometry.vectors import finite_rows, lengths, unit_vectors
+from slviewer.geometry.vectors import box_middle, finite_rows, lengths, unit_vectors
 from slviewer.target.board import Board
 
 DECISION_SIGMAS = 5.0
@@ -33,7 +33,7 @@ def is_numbering_ambiguous(notation: str) -> bool:
 
 def opposite_features(points: np.ndarray) -> np.ndarray | None:
     """Return the index (f,) of the feature opposite to each of ``points`` (f, 3) mm; None without that symmetry."""
-    middle = (points.min(0) + points.max(0)) / 2
+    middle = box_middle(points)
     away = lengths((2 * middle - points)[:, None, :2] - points[None, :, :2])
     partner = np.argmin(away, axis=1)
     apart = away[np.arange(len(points)), partner].max()
@@ -70,7 +70,7 @@ def renumber_poses(state: State, data: PoseData, poses: np.ndarray) -> tuple[Sta
     partner = opposite_features(data.points)
     if partner is None or not poses.any():
         return state, data
-    middle = (data.points.min(0) + data.points.max(0)) / 2
+    middle = box_middle(data.points)
     feature, R, t = data.feature.copy(), state.R_board.copy(), state.t_board.copy()
     for i in np.nonzero(poses)[0]:
         part = slice(data.feature_from[i], data.feature_from[i + 1])

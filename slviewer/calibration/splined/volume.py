@@ -42,19 +42,19 @@ class Volume:
 def working_volume(
     rig: Arrangement,
     calibrated_mm: tuple[float, float],
-    reach: tuple[float, float] = DEPTH_FACTORS,
     columns: int = 9,
     rows: int = 7,
     depths: int = 5,
 ) -> Volume:
     """Return the points of a regular grid over the camera's image and depths that the projector's image contains.
 
-    ``calibrated_mm``: nearest and farthest calibrated depth, multiplied by ``reach``; ``columns``, ``rows``, ``depths``
-    of the grid. Raises InputError for an empty range of depths, and where the projector's image contains no point.
+    ``calibrated_mm``: nearest and farthest calibrated depth, multiplied by ``DEPTH_FACTORS``; ``columns``, ``rows``,
+    ``depths`` of the grid. Raises InputError for an empty range of depths, and where the projector's image contains no
+    point.
     """
-    near, far = reach[0] * calibrated_mm[0], reach[1] * calibrated_mm[1]
+    near, far = (factor * mm for factor, mm in zip(DEPTH_FACTORS, calibrated_mm, strict=True))
     if not 0 < near < far:
-        raise InputError(f"calibrated depths {calibrated_mm} mm and a reach of {reach} leave no volume")
+        raise InputError(f"calibrated depths {calibrated_mm} mm leave no volume")
     width, height = rig.camera.size
     u, v, z = np.meshgrid(
         np.linspace(0, width - 1, columns),

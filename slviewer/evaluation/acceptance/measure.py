@@ -35,6 +35,11 @@ class Position:
     incidence: dict[str, float] | None
     warnings: tuple[str, ...]
 
+    @property
+    def properties(self) -> set[str]:
+        """Names of the properties that were measured here."""
+        return {figure.property for figure in self.figures}
+
     def error(self, name: str) -> AcceptanceFigure:
         """The worst figure of a property at this position."""
         return max((f for f in self.figures if f.property == name), key=lambda f: abs(f.error_mm))
