@@ -74,7 +74,7 @@ def _fit_windows(first, last, field, weight, pixels, radius, out):  # type: igno
         if count < 30:
             continue
         middle = np.median(value[:count])
-        inliers = _fit_quadratic(basis[:count], value[:count] - middle, base[:count], robust[:count], solution)
+        inliers = _fit_quadratic(count, middle, basis, value, base, robust, solution)
         if inliers >= 0.5 * count:
             out[i, 0], out[i, 1], out[i, 2] = solution[0] + middle, solution[1] / r, solution[2] / r
 
@@ -107,14 +107,14 @@ def _collect_samples(field, weight, cu, cv, r, basis, value, base):  # type: ign
 
 
 @kernel()
-def _fit_quadratic(basis, value, base, robust, solution):  # type: ignore[no-untyped-def]
-    """Fit ``solution`` (6,) to values (k,) of terms ``basis`` (k, 6) and weights ``base`` (k,), by Tukey's weights.
+def _fit_quadratic(count, middle, basis, value, base, robust, solution):  # type: ignore[no-untyped-def]
+    """Fit ``solution`` (6,) to the first ``count`` values (k,) less ``middle``, with Tukey's weights.
 
-    Fills ``robust`` (k,) with these, and returns the number of inliers.
+    ``basis`` (k, 6): the terms; ``base`` (k,): the weights. Fills ``robust`` (k,) with Tukey's, and returns the number
+    of inliers.
     """
-    count = len(value)
     residual = np.empty(count)
-    robust[:] = 1.0
+    robust[:count] = 1.0
     for _ in range(5):
         A, b = np.zeros((6, 6)), np.zeros(6)
         for k in range(count):
@@ -122,7 +122,7 @@ def _fit_quadratic(basis, value, base, robust, solution):  # type: ignore[no-unt
             if w > 0:
                 for p in range(6):
                     wp = w * basis[k, p]
-                    b[p] += wp * value[k]
+                    b[p] += wp * (value[k] - middle)
                     for q in range(p + 1):
                         A[p, q] += wp * basis[k, q]
         trace = np.trace(A)
@@ -133,9 +133,9 @@ def _fit_quadratic(basis, value, base, robust, solution):  # type: ignore[no-unt
             fitted = 0.0
             for p in range(6):
                 fitted += basis[k, p] * solution[p]
-            residual[k] = value[k] - fitted
+            residual[k] = value[k] - middle - fitted
         scale = 4.685 * 1.4826 * np.median(np.abs(residual)) + 1e-6
         for k in range(count):
             t = residual[k] / scale
             robust[k] = (1 - t * t) ** 2 if abs(t) < 1 else 0.0
-    return np.count_nonzero(robust > 0.1)
+    return np.count_nonzero(robust[:count] > 0.1)
