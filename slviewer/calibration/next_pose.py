@@ -44,6 +44,10 @@ _FREE = 0.015  # of the image's width, left free around the board
 _FINE = 5  # samples along each side of a cell
 
 
+Illumination = Callable[[np.ndarray], np.ndarray]
+"""Tells which points (n, 3) mm in the camera's frame the projector reaches, (n,) bool."""
+
+
 @dataclass(frozen=True, eq=False)
 class Coverage:
     """Number of poses that cover each cell of the image (3, 4), each third of the depths (3,), and each tilt (5,).
@@ -125,7 +129,7 @@ def suggest(
     lens: Lens,
     poses: Sequence[np.ndarray],
     *,
-    illuminated: Callable[[np.ndarray], np.ndarray] | None = None,
+    illuminated: Illumination | None = None,
     skip: int = 0,
 ) -> Suggestion:
     """Suggest the pose that improves the coverage by `poses` most, with the whole board in view.
@@ -161,9 +165,7 @@ def describe_suggestion(board: Board, lens: Lens, T_camera_board: np.ndarray) ->
     return Suggestion(T_camera_board, corners, _describe_pose(thirds[0], tilts[0], corners.mean(0), lens.size))
 
 
-def projector_reach(
-    points: np.ndarray, pixels: np.ndarray, size: tuple[int, int]
-) -> Callable[[np.ndarray], np.ndarray] | None:
+def projector_reach(points: np.ndarray, pixels: np.ndarray, size: tuple[int, int]) -> Illumination | None:
     """Estimate the projector's field of view by linear resection (DLT) from points (n, 3) mm and pixels (n, 2).
 
     Points are in the camera's frame. Returns a function points (k, 3) mm -> (k,) bool, or None where the points do not
@@ -197,7 +199,7 @@ def _list_candidates(
     lens: Lens,
     span: tuple[float, float],
     count: int,
-    illuminated: Callable[[np.ndarray], np.ndarray] | None,
+    illuminated: Illumination | None,
 ) -> np.ndarray:
     """Return poses (k, 4, 4) at every depth, tilt and direction, each as far off-centre as the whole board is visible.
 
@@ -222,9 +224,7 @@ def _list_candidates(
     return chosen[visible.any(axis=-1) & far_enough]
 
 
-def _is_visible(
-    board: Board, lens: Lens, T: np.ndarray, illuminated: Callable[[np.ndarray], np.ndarray] | None
-) -> np.ndarray:
+def _is_visible(board: Board, lens: Lens, T: np.ndarray, illuminated: Illumination | None) -> np.ndarray:
     """(n,) bool: whether the board's outline at poses (n, 4, 4) is inside the image, with a margin, and illuminated."""
     corners = move_points(T, board.outline())
     pixels = lens.project(corners)

@@ -8,6 +8,7 @@ import numpy as np
 
 from slviewer.errors import InputError
 from slviewer.geometry.brown import distort_all, fold_radius_squared, project_all, undistort_all
+from slviewer.geometry.jit import read_only
 
 FOCAL_PX = 1.0, 1e7
 """Focal lengths that a lens may have; the principal point is as near to the image as the longest."""
@@ -65,11 +66,7 @@ class Lens:
             raise InputError(
                 f"The distortion coefficients {D.tolist()} belong to no lens: check them, or calibrate again."
             )
-        K.setflags(write=False)
-        D.setflags(write=False)
-        object.__setattr__(self, "K", K)
-        object.__setattr__(self, "D", D)
-        object.__setattr__(self, "size", (width, height))
+        vars(self).update(K=read_only(K), D=read_only(D), size=(width, height))
 
     @classmethod
     def from_parameters(cls, parameters: Iterable[float], size: tuple[int, int]) -> "Lens":
@@ -119,9 +116,7 @@ class Lens:
         """(h, w, 2) float64: undistorted normalised coordinates of every pixel, read-only."""
         width, height = self.size
         v, u = np.mgrid[:height, :width]
-        rays = self.undistort(np.stack([u, v], axis=-1))
-        rays.setflags(write=False)
-        return rays
+        return read_only(self.undistort(np.stack([u, v], axis=-1)))
 
     def resize(self, factor: float) -> "Lens":
         """Return the same lens at another resolution: pixel centres stay at whole numbers, so c' = (c + 0.5) factor -

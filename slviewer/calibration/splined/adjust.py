@@ -13,6 +13,7 @@ from slviewer.calibration.splined.bundle import Bundle, PoseFit
 from slviewer.calibration.splined.half_turns import detect_half_turns, is_numbering_ambiguous, renumber_poses
 from slviewer.calibration.splined.normal import (
     BlockFactor,
+    ObservedValues,
     PoseData,
     factorize,
     normal_equations,
@@ -173,7 +174,7 @@ def _adjust(
     )
 
 
-def _residuals(state: State, data: PoseData) -> tuple[np.ndarray, np.ndarray]:
+def _residuals(state: State, data: PoseData) -> ObservedValues:
     """Return the residuals of features (n, 2) and of samples (m, 2), px."""
     features, samples = predict_observations(state, data)
     return data.feature_px - features, data.projector_px - samples
@@ -181,8 +182,8 @@ def _residuals(state: State, data: PoseData) -> tuple[np.ndarray, np.ndarray]:
 
 def _cost(
     state: State,
-    residuals: tuple[np.ndarray, np.ndarray],
-    weights: tuple[np.ndarray, np.ndarray],
+    residuals: ObservedValues,
+    weights: ObservedValues,
     prior: Prior,
     strengths: Sequence[float],
 ) -> float:
@@ -196,12 +197,12 @@ def _cost(
 
 def _take_step(
     state: State,
-    residuals: tuple[np.ndarray, np.ndarray],
+    residuals: ObservedValues,
     data: PoseData,
-    cost: Callable[[State, tuple[np.ndarray, np.ndarray]], float],
+    cost: Callable[[State, ObservedValues], float],
     system: tuple[np.ndarray, np.ndarray, np.ndarray],
     damping: float,
-) -> tuple[State, tuple[np.ndarray, np.ndarray], np.ndarray, float]:
+) -> tuple[State, ObservedValues, np.ndarray, float]:
     """Take a Gauss-Newton step; damp it where it does not lower the cost.
 
     ``system``: information matrix, right-hand side, and full step. Only lenses and relative pose are damped: together
@@ -226,14 +227,12 @@ def _pack_factor(factor: np.ndarray) -> np.ndarray:
     return np.asarray(factor[np.tri(len(factor), dtype=bool)], np.float32)
 
 
-def _sigmas(
-    residuals: tuple[np.ndarray, np.ndarray], noise: Noise, sample_sigma: np.ndarray, data: PoseData
-) -> tuple[np.ndarray, np.ndarray]:
+def _sigmas(residuals: ObservedValues, noise: Noise, sample_sigma: np.ndarray, data: PoseData) -> ObservedValues:
     """Return the standard deviations of features (n, 2) and samples (m, 2), px."""
     return pose_sigmas(residuals[0], data.feature_from, noise), noise.sigmas(sample_sigma)
 
 
-def _zero_weights(weights: tuple[np.ndarray, np.ndarray], is_excluded: np.ndarray, data: PoseData) -> None:
+def _zero_weights(weights: ObservedValues, is_excluded: np.ndarray, data: PoseData) -> None:
     """Set the weights of the excluded poses (p,) bool to 0, in place."""
     for w, start in zip(weights, (data.feature_from, data.sample_from), strict=True):
         for i in np.nonzero(is_excluded)[0]:
@@ -242,8 +241,8 @@ def _zero_weights(weights: tuple[np.ndarray, np.ndarray], is_excluded: np.ndarra
 
 def _fit_statistics(
     names: Sequence[str],
-    residuals: tuple[np.ndarray, np.ndarray],
-    sigmas: tuple[np.ndarray, np.ndarray],
+    residuals: ObservedValues,
+    sigmas: ObservedValues,
     data: PoseData,
 ) -> dict[str, PoseFit]:
     """Compute the RMS residuals and the trust of each pose, excluded ones included."""
@@ -268,7 +267,7 @@ def _depth_range(state: State, data: PoseData, is_excluded: np.ndarray) -> tuple
     return float(z.min()), float(z.max())
 
 
-def _count_poses(state: State, weights: tuple[np.ndarray, np.ndarray], data: PoseData) -> tuple[np.ndarray, np.ndarray]:
+def _count_poses(state: State, weights: ObservedValues, data: PoseData) -> tuple[np.ndarray, np.ndarray]:
     """Count the poses that illuminated each cell (rows, columns) uint16 of the camera's and the projector's field."""
     counts = []
     for device, pixels in ((state.rig.camera, data.sample_px), (state.rig.projector, data.projector_px)):

@@ -22,6 +22,10 @@ CAMERA_FIELD, PROJECTOR_FIELD, ROW = DENSE, DENSE + 2 * FIELD, DENSE + 4 * FIELD
 the dense part; and the row's length."""
 
 
+ObservedValues = tuple[np.ndarray, np.ndarray]
+"""A value of each coordinate of all features, (n, 2), and of all samples, (m, 2)."""
+
+
 class PoseData(NamedTuple):
     """What was observed, all poses one after another.
 
@@ -82,7 +86,7 @@ def allocate_workspace():
     )  # fmt: skip
 
 
-def predict_observations(state: State, data: PoseData) -> tuple[np.ndarray, np.ndarray]:
+def predict_observations(state: State, data: PoseData) -> ObservedValues:
     """Predict the features (n, 2) px and the samples' projector coordinates (m, 2) px; NaN where not visible."""
     features, samples = np.empty_like(data.feature_px), np.empty_like(data.sample_px)
     model = state.rig, state.R_board, state.t_board, state.heights, state.offsets
@@ -93,7 +97,7 @@ def predict_observations(state: State, data: PoseData) -> tuple[np.ndarray, np.n
 
 
 def normal_equations(
-    state: State, data: PoseData, residuals: tuple[np.ndarray, np.ndarray], weights: tuple[np.ndarray, np.ndarray]
+    state: State, data: PoseData, residuals: ObservedValues, weights: ObservedValues
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return J'WJ (N, N), of which the upper triangle is filled, and J'W r (N,).
 
