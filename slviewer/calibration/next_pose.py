@@ -227,9 +227,7 @@ def _list_candidates(
 def _is_visible(board: Board, lens: Lens, T: np.ndarray, illuminated: Illumination | None) -> np.ndarray:
     """(n,) bool: whether the board's outline at poses (n, 4, 4) is inside the image, with a margin, and illuminated."""
     corners = move_points(T, board.outline())
-    pixels = lens.project(corners)
-    free = _FREE * lens.size[0]
-    inside = np.asarray(((pixels > free) & (pixels < np.array(lens.size) - 1 - free)).all(axis=(1, 2)))
+    inside = np.asarray(lens.contains(lens.project(corners), _FREE * lens.size[0] + 0.5).all(axis=1))
     if illuminated is not None:
         inside[inside] = illuminated(corners[inside].reshape(-1, 3)).reshape(-1, corners.shape[1]).all(axis=1)
     return inside

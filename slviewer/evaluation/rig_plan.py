@@ -197,10 +197,7 @@ def _plane_points(rig: StereoRig, z: float) -> np.ndarray:
 
 def _is_illuminated(rig: StereoRig, z: float) -> np.ndarray:
     """Return which camera pixels (h, w) see the projector's picture on the plane at depth z."""
-    pixels = rig.project(_plane_points(rig, z))
-    with np.errstate(invalid="ignore"):
-        inside = (pixels > -0.5) & (pixels < np.array(rig.projector.size) - 0.5)
-    return np.asarray(inside.all(axis=2))
+    return rig.projector.contains(rig.project(_plane_points(rig, z)))
 
 
 @dataclass(frozen=True)

@@ -107,6 +107,12 @@ class Lens:
         undistort_all(flat, self.parameters, normalised)
         return normalised.reshape(np.shape(pixels))
 
+    def contains(self, pixels: np.ndarray, margin_px: float = 0.0) -> np.ndarray:
+        """(...,) bool: pixels (..., 2) inside the image less a margin; False for NaN."""
+        with np.errstate(invalid="ignore"):
+            inside = (pixels > margin_px - 0.5) & (pixels < np.array(self.size) - 0.5 - margin_px)
+        return np.asarray(inside.all(axis=-1))
+
     def rays(self) -> np.ndarray:
         """(h, w, 2) float64: undistorted normalised coordinates of every pixel; computed once, read-only."""
         return self._rays

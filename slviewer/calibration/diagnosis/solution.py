@@ -86,12 +86,10 @@ def _is_illuminated(pixels: np.ndarray, stereo: StereoModel) -> np.ndarray:
     """(n,) bool: camera pixels (n, 2) on whose rays the projector illuminates two of three of the boards' depths."""
     near, far = stereo.depth_range_mm or (0.0, 0.0)
     rays = stereo.rig.camera.undistort(pixels)
-    size = np.array(stereo.rig.projector.size)
     inside = []
     for z in (near, (near + far) / 2, far):
         projected = stereo.rig.project(np.column_stack([rays * z, np.full(len(rays), z)]))
-        with np.errstate(invalid="ignore"):
-            inside.append(((projected > -0.5) & (projected < size - 0.5)).all(1))
+        inside.append(stereo.rig.projector.contains(projected))
     return np.sum(inside, axis=0) >= 2
 
 

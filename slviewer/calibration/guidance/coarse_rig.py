@@ -128,8 +128,10 @@ class GuidanceModel:
         widths of the image.
         """
         X = move_points(T_camera_board, points)
-        pixels, camera, projector = self.stereo.camera.project(X), self.stereo.camera, self.stereo.projector
-        return pixels, _is_inside(pixels, camera, margin) & _is_inside(self.stereo.project(X), projector, margin)
+        camera, projector = self.stereo.camera, self.stereo.projector
+        pixels = camera.project(X)
+        seen = camera.contains(pixels, margin * camera.size[0])
+        return pixels, seen & projector.contains(self.stereo.project(X), margin * projector.size[0])
 
     def prior(self) -> Floats:
         """Return the information matrix (unknowns, unknowns) before any pose, in the order of ``layout``."""
@@ -162,13 +164,6 @@ def _coarse_device(lens: Lens) -> Device:
     width, height = lens.size
     down = int(np.clip(round(COARSE_CELLS * height / width), 4, 2 * COARSE_CELLS))
     return Device(lens.parameters, np.zeros((2, down + 3, COARSE_CELLS + 3)), np.array(lens.size, float))
-
-
-def _is_inside(pixels: Floats, lens: Lens, margin: float) -> NDArray[np.bool_]:
-    """(...,) bool: pixels (..., 2) inside the lens's image less a margin in image widths; False for NaN."""
-    margin_px = margin * lens.size[0]
-    with np.errstate(invalid="ignore"):
-        return np.asarray(((pixels > margin_px - 0.5) & (pixels < np.array(lens.size) - 0.5 - margin_px)).all(-1))
 
 
 def estimate_rig(
