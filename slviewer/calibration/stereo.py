@@ -197,9 +197,10 @@ class _Solution:
         Raises CalibrationRejected where OpenCV finds no solution or a focal length is not positive, and if ``strict``
         where one is too uncertain.
         """
-        objects = [o.points[inliers[o.name]].astype(np.float32) for o in used]
-        cameras = [o.camera[inliers[o.name]].astype(np.float32) for o in used]
-        projectors = [o.projector[inliers[o.name]].astype(np.float32) for o in used]
+        objects, cameras, projectors = (
+            [getattr(o, name)[inliers[o.name]].astype(np.float32) for o in used]
+            for name in ("points", "camera", "projector")
+        )
         sigma: dict[str, float] = {}
         intrinsics = []
         for device, images, size in (("camera", cameras, used[0].size), ("projector", projectors, projector_size)):

@@ -30,6 +30,18 @@ def move_points(T: Floats, points: np.ndarray) -> Floats:
     return points @ np.swapaxes(T[..., :3, :3], -1, -2) + T[..., None, :3, 3]
 
 
+def motion_jacobian(arm: Floats) -> Floats:
+    """Return the derivatives (m, 3, 6) of points by a small rotation (rad) about a centre and a shift (mm).
+
+    ``arm`` (m, 3) mm: the points less the centre.
+    """
+    J = np.zeros((len(arm), 3, 6))
+    J[:, :, 3:] = np.eye(3)
+    for k, (a, b) in enumerate(((1, 2), (2, 0), (0, 1))):  # rotation x arm
+        J[:, a, k], J[:, b, k] = -arm[:, b], arm[:, a]
+    return J
+
+
 def nearest_rotation(M: Floats) -> Floats:
     """(3, 3): the rotation nearest to a matrix (3, 3) in the Frobenius norm."""
     U, _, Vt = np.linalg.svd(M)

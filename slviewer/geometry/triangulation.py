@@ -1,6 +1,7 @@
 """Depth from one projector coordinate per camera pixel, exact under both lenses' distortion."""
 
 import math
+from collections.abc import Iterable
 from typing import Literal
 
 import numba
@@ -31,7 +32,7 @@ def triangulate(
     behind a device, more than a tenth outside the projector's image or past the fold of a lens, the steps do not
     converge, or z lies outside ``z_range`` (mm). Raises InputError where the map has not the camera's image size.
     """
-    _check_map(rig, coordinate, "projector coordinates")
+    check_map(rig.camera.size, coordinate, "projector coordinates")
     z = _solve(rig, rig.camera.rays().reshape(-1, 2), np.asarray(coordinate).reshape(-1), axis)
     if z_range is not None:
         z[~((z >= z_range[0]) & (z <= z_range[1]))] = np.nan
@@ -61,7 +62,7 @@ def depth_per_px(rig: StereoRig, axis: Literal["x", "y"], z: np.ndarray) -> np.n
 
     What a projector coordinate's uncertainty becomes in depth; NaN where z is, or where the point cannot be projected.
     """
-    _check_map(rig, z, "depths")
+    check_map(rig.camera.size, z, "depths")
     slopes = np.empty(np.size(z))
     rays, depths = _as_read_only(rig.camera.rays().reshape(-1, 2)), _as_read_only(np.asarray(z).reshape(-1))
     _coordinate_slopes(rays, depths, rig.R.copy(), rig.t.copy(), rig.projector.parameters, _axis_row(axis), slopes)
@@ -104,9 +105,9 @@ def _axis_row(axis: str) -> int:
     return 0 if axis == "x" else 1
 
 
-def _check_map(rig: StereoRig, values: np.ndarray, what: str) -> None:
-    """Raise InputError unless a map has the size (h, w) of the rig's camera."""
-    width, height = rig.camera.size
+def check_map(size: Iterable[float], values: np.ndarray, what: str) -> None:
+    """Raise InputError unless a map has the size (width, height) of the camera's image."""
+    width, height = map(int, size)
     if np.shape(values) != (height, width):
         raise InputError(
             f"A map of {what} of shape {np.shape(values)} was given, and the camera was calibrated at {width}x{height} "

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from slviewer.errors import InputError
-from slviewer.geometry.rigid import Floats, fit_rigid, move_points
+from slviewer.geometry.rigid import Floats, fit_rigid, motion_jacobian, move_points
 from slviewer.geometry.robust import robust_sigma, tukey_weights
 from slviewer.geometry.vectors import diagonal, lengths, rms_length
 from slviewer.reconstruction.cloud import Cloud
@@ -72,7 +72,7 @@ class MarkerPose:
         about ``centre`` (3,) and a shift, as those of residuals of ``sigma_mm``."""
         placed = move_points(T, self.scan_corners)
         weight = (sigma_mm / self.sigma_mm) ** 2
-        J = corner_jacobian(placed - centre)
+        J = motion_jacobian(placed - centre)
         H = np.einsum("mij,mik,m->jk", J, J, weight)
         return H, np.einsum("mij,mi,m->j", J, placed - self.reference_corners, weight)
 
@@ -81,15 +81,6 @@ class MarkerPose:
         """Uncertainty of the pose about the corners' middle."""
         centre = move_points(self.T, self.scan_corners).mean(axis=0)
         return Uncertainty(np.linalg.inv(self.normal_equations(self.T, centre, 1.0)[0]), centre)
-
-
-def corner_jacobian(arm: Floats) -> Floats:
-    """Derivatives (m, 3, 6) of points ``arm`` (m, 3) mm from the centre by a small rotation (rad) and shift (mm)."""
-    J = np.zeros((len(arm), 3, 6))
-    J[:, :, 3:] = np.eye(3)
-    for k, (a, b) in enumerate(((1, 2), (2, 0), (0, 1))):  # rotation x arm
-        J[:, a, k], J[:, b, k] = -arm[:, b], arm[:, a]
-    return J
 
 
 def measure_markers(cloud: Cloud) -> MeasuredMarkers:

@@ -18,10 +18,10 @@ from slviewer.calibration.splined.uncertainty import SigmaMap, compute_sigma_map
 from slviewer.calibration.splined.unknowns import Arrangement, pinhole_lens
 from slviewer.calibration.splined.volume import in_illuminated_cells, select_depth_axis, working_volume
 from slviewer.calibration.stereo import StereoModel
-from slviewer.errors import InputError
 from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.rig import StereoRig
+from slviewer.geometry.triangulation import check_map
 from slviewer.geometry.vectors import rms
 
 NEAR, FAR = 0.7, 1.4
@@ -134,7 +134,7 @@ class SplinedModel:
         NaN where the phase is invalid, beyond ``depths_mm``, and, if ``supported``, in cells that no target pose
         illuminated.
         """
-        self._check(phase)
+        check_map(self.rig.camera.size, phase.phase, "phases")
         px_per_rad = phase.period_px / (2 * np.pi)
         return self.fast_axis(phase.axis).depth(phase.phase, px_per_rad, self.single_rays, supported)
 
@@ -144,7 +144,7 @@ class SplinedModel:
 
     def depth_per_rad(self, phase: PhaseMap) -> np.ndarray:
         """(h, w) float32: |dz/dphi| mm/rad at the phases measured."""
-        self._check(phase)
+        check_map(self.rig.camera.size, phase.phase, "phases")
         px_per_rad = phase.period_px / (2 * np.pi)
         return self.fast_axis(phase.axis).depth_per_px(phase.phase, px_per_rad) * np.float32(px_per_rad)
 
@@ -248,15 +248,6 @@ class SplinedModel:
     def from_arrays(cls, data: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> "SplinedModel":
         """The inverse of ``to_dict`` and ``to_arrays``."""
         return cls(Bundle.from_arrays(data, arrays))
-
-    def _check(self, phase: PhaseMap) -> None:
-        """Raise InputError for a phase map of another size than the camera's image."""
-        width, height = (int(n) for n in self.rig.camera.size)
-        if phase.phase.shape != (height, width):
-            raise InputError(
-                f"A phase map of shape {phase.phase.shape} was given, and the camera was calibrated at "
-                f"{width}x{height} px: use captures of the same camera, at the same resolution and without cropping."
-            )
 
 
 def calibrate_splined(

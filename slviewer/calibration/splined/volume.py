@@ -9,7 +9,7 @@ from slviewer.calibration.splined.unknowns import Arrangement
 from slviewer.errors import InputError
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.jit import kernel
-from slviewer.geometry.rigid import Floats
+from slviewer.geometry.rigid import Floats, motion_jacobian
 from slviewer.geometry.vectors import finite_rows, rms
 
 DEPTH_FACTORS = (0.87, 1.13)
@@ -156,16 +156,8 @@ def sigma_3d(whitened: np.ndarray) -> np.ndarray:
 
 def _motion_basis(points: np.ndarray, centre: np.ndarray, arm: float) -> np.ndarray:
     """Return the displacements (3 n, 6) of points (n, 3) by translations and by rotations about ``centre``."""
-    x, y, z = ((points - centre) / arm).T
-    none, one = np.zeros(len(points)), np.ones(len(points))
-    along = np.array(
-        [
-            [one, none, none, none, z, -y],
-            [none, one, none, -z, none, x],
-            [none, none, one, y, -x, none],
-        ]
-    )
-    return along.transpose(2, 0, 1).reshape(-1, 6)
+    J = motion_jacobian((points - centre) / arm)
+    return J[:, :, [3, 4, 5, 0, 1, 2]].reshape(-1, 6)
 
 
 @kernel()
