@@ -5,6 +5,8 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
+from slviewer.geometry.vectors import finite_rows, lengths, rms
+
 MIN_FEATURES = 12
 """Nine unknowns, and some features more."""
 OUTLIER_SIGMAS = 6.0
@@ -36,7 +38,7 @@ class BoardPlane:
         ``size``: (width, height) px of the camera. None where fewer than MIN_FEATURES inliers remain.
         """
         centre, radius = (np.array(size) - 1) / 2, float(np.hypot(*size)) / 2
-        inlier = np.isfinite(projector).all(1) & np.isfinite(camera).all(1)
+        inlier = finite_rows(projector, camera)
         plane = None
         for _ in range(5):
             if np.count_nonzero(inlier) < MIN_FEATURES:
@@ -44,7 +46,7 @@ class BoardPlane:
             plane = cls._fit_inliers(camera[inlier], projector[inlier], centre, radius)
             if plane is None:
                 return None
-            residual = np.linalg.norm(plane.predict(camera[:, 0], camera[:, 1]) - projector, axis=1)
+            residual = lengths(plane.predict(camera[:, 0], camera[:, 1]) - projector)
             before = inlier
             inlier = residual < np.maximum(OUTLIER_SIGMAS * np.median(residual[inlier]) / 1.1774, 0.5)
             if np.array_equal(inlier, before):
@@ -65,10 +67,10 @@ class BoardPlane:
                     continue
                 plane = cls(H, float(bend), centre, radius, np.zeros(2))
                 residuals = plane.predict(camera[:, 0], camera[:, 1]) - projector
-                rms = float(np.sqrt(np.mean(residuals**2)))
-                if best is None or rms < best[0]:
+                error = rms(residuals)
+                if best is None or error < best[0]:
                     reach = MIN_TOLERANCE_PX + TOLERANCE_RATIO * np.abs(residuals).max(0)
-                    best = rms, replace(plane, reach=reach)
+                    best = error, replace(plane, reach=reach)
             if best is None:
                 return None
             bends = best[1].bend + np.linspace(-step, step, 7)
@@ -91,7 +93,7 @@ class BoardPlane:
         height, width = coordinate.shape
         expected = self.predict(np.arange(width)[None] + origin[0], np.arange(height)[:, None] + origin[1])
         with np.errstate(invalid="ignore"):
-            return np.asarray(np.abs(coordinate - expected[..., along]) < self.reach[along])
+            return np.abs(coordinate - expected[..., along]) < self.reach[along]
 
 
 def _undistort_division(normalised: np.ndarray, bend: float) -> np.ndarray:

@@ -4,18 +4,18 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import cv2
 import numpy as np
 
+from slviewer.calibration.board_pose import solve_device
 from slviewer.calibration.centres import centroid_shifts
 from slviewer.calibration.diagnosis.poses import FEW_POSES
 from slviewer.calibration.diagnosis.rules import HIGH_REPROJECTION_PX, MAX_FOCAL_UNCERTAINTY, MIN_TILT_DEG
 from slviewer.calibration.diagnosis.verdict import Finding, Verdict
-from slviewer.calibration.soundness import MIN_POSES
-from slviewer.calibration.stereo import ITERATIONS, MAX_FOCAL_SIGMA, rms_length
-from slviewer.errors import CalibrationRejected
+from slviewer.calibration.soundness import check_pose_count
+from slviewer.calibration.stereo import MAX_FOCAL_SIGMA
 from slviewer.geometry.lens import Lens
-from slviewer.geometry.rigid import move_points, transform_from_rvec
+from slviewer.geometry.rigid import largest_angle_deg, move_points
+from slviewer.geometry.vectors import rms_length
 from slviewer.target.board import Board
 from slviewer.target.detect import Detection
 
@@ -82,11 +82,7 @@ def calibrate_camera(
     the reason. Raises CalibrationRejected for fewer than three pictures.
     """
     names = list(detections)
-    if len(names) < MIN_POSES:
-        why = "".join(f"; {name}: {reason}" for name, reason in (excluded or {}).items())
-        raise CalibrationRejected(
-            f"the board was detected in {len(names)} pictures, and at least {MIN_POSES} are needed{why}"
-        )
+    check_pose_count(len(names), excluded or {})
     points = [board.points[detections[name].ids] for name in names]
     pixels = [np.asarray(detections[name].pixels, float) for name in names]
     lens, poses, sigma = _solve_camera(points, pixels, size)
@@ -109,25 +105,13 @@ def calibrate_camera(
 def _solve_camera(
     points: list[np.ndarray], pixels: list[np.ndarray], size: tuple[int, int]
 ) -> tuple[Lens, list[np.ndarray], tuple[float, float]]:
-    """Solve a pinhole and Brown lens by ``cv2.calibrateCamera`` from points (n, 3) mm and pixels (n, 2) by picture.
+    """Solve the camera's lens from points (n, 3) mm and pixels (n, 2) by picture, as ``solve_device`` does.
 
-    Returns the lens, T_camera_board (4, 4) mm of each picture, and the standard deviations of fx and fy in px. Raises
-    CalibrationRejected where OpenCV finds no solution.
+    Returns the lens, T_camera_board (4, 4) mm of each picture, and the standard deviations of fx and fy in px.
     """
-    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, ITERATIONS, 1e-9)
     objects, images = [p.astype(np.float32) for p in points], [p.astype(np.float32) for p in pixels]
-    try:
-        _, K, D, rvecs, tvecs, deviations, _, _ = cv2.calibrateCameraExtended(
-            objects, images, size, np.zeros((3, 3)), np.zeros(5), criteria=criteria
-        )
-    except cv2.error as error:
-        raise CalibrationRejected(
-            f"the camera's lens could not be solved from {len(points)} pictures: show the board in more positions and "
-            f"tilts ({error.err})"
-        ) from error
-    poses = [transform_from_rvec(rvec, tvec) for rvec, tvec in zip(rvecs, tvecs, strict=True)]
-    fx, fy = (float(s) for s in deviations.ravel()[:2])
-    return Lens(np.array(K), np.array(D).ravel()[:5], size), poses, (fx, fy)
+    K, D, poses, sigma = solve_device("camera", objects, images, size)
+    return Lens(K, D, size), poses, sigma
 
 
 def _judge_camera(
@@ -148,8 +132,7 @@ def _judge_camera(
                 f"take {FEW_POSES} at least, better a dozen",
             )
         )
-    normals = np.array([T[:3, 2] for T in poses])
-    spread = float(np.degrees(np.arccos(np.clip(normals @ normals.T, -1, 1).min())))
+    spread = largest_angle_deg(np.array([T[:3, 2] for T in poses]))
     if spread < MIN_TILT_DEG:
         findings.append(
             Finding(

@@ -1,18 +1,18 @@
 """The projector coordinate at a board feature, and its slopes there, read from the phase around it."""
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slviewer.geometry.jit import kernel, run_rows
+from slviewer.geometry.rigid import Floats
 
+MAX_SAMPLES = 1024
+"""Samples that a window may have; they are not more than 31 along either side."""
 MAX_OFF_CENTRE = 0.35
 """Largest distance, in half widths, between the centroid of a window's samples and its centre; beyond it, the fit would
 extrapolate. At a chessboard's corner two opposite squares are bright, and their centroid is the corner."""
 
 
-def fit_local_values(
-    field: np.ndarray, weight: np.ndarray, pixels: NDArray[np.float64], radius: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def fit_local_values(field: np.ndarray, weight: np.ndarray, pixels: Floats, radius: Floats) -> tuple[Floats, Floats]:
     """Fit value and slopes of ``field`` (h, w) at sub-pixel ``pixels`` (n, 2), by a robust quadratic around each.
 
     ``radius`` (n,) px: half the width of each window; ``weight`` (h, w): 0 where the field is not used, so that the
@@ -66,72 +66,76 @@ def _fit_windows(first, last, field, weight, pixels, radius, out):  # type: igno
 
     Where a fit is not possible, ``out`` stays as it is.
     """
-    height, width = field.shape
-    basis = np.empty((1024, 6))
-    value = np.empty(1024)
-    base = np.empty(1024)
-    robust = np.empty(1024)
+    basis, value, base = np.empty((MAX_SAMPLES, 6)), np.empty(MAX_SAMPLES), np.empty(MAX_SAMPLES)
+    robust, solution = np.empty(MAX_SAMPLES), np.zeros(6)
     for i in range(first, last):
-        cu, cv, r = pixels[i, 0], pixels[i, 1], radius[i]
-        if not (np.isfinite(cu) and np.isfinite(cv) and r > 1):
-            continue
-        stride = max(1, int(np.ceil(2 * r / 30)))
-        u0, u1 = max(0, int(np.ceil(cu - r))), min(width - 1, int(np.floor(cu + r)))
-        v0, v1 = max(0, int(np.ceil(cv - r))), min(height - 1, int(np.floor(cv + r)))
-        count = 0
-        mean_x = mean_y = 0.0
-        for v in range(v0, v1 + 1, stride):
-            for u in range(u0, u1 + 1, stride):
-                if weight[v, u] > 0 and count < 1024:
-                    x, y = (u - cu) / r, (v - cv) / r
-                    basis[count, 0] = 1.0
-                    basis[count, 1] = x
-                    basis[count, 2] = y
-                    basis[count, 3] = x * x
-                    basis[count, 4] = x * y
-                    basis[count, 5] = y * y
-                    value[count] = field[v, u]
-                    base[count] = weight[v, u]
-                    mean_x += x
-                    mean_y += y
-                    count += 1
-        if count < 30 or np.hypot(mean_x, mean_y) > MAX_OFF_CENTRE * count:
+        r = radius[i]
+        count = _collect_samples(field, weight, pixels[i, 0], pixels[i, 1], r, basis, value, base)
+        if count < 30:
             continue
         middle = np.median(value[:count])
-        robust[:count] = 1.0
-        solution = np.zeros(6)
-        for _ in range(5):
-            A = np.zeros((6, 6))
-            b = np.zeros(6)
-            for k in range(count):
-                w = base[k] * robust[k]
-                if w > 0:
-                    for p in range(6):
-                        wp = w * basis[k, p]
-                        b[p] += wp * (value[k] - middle)
-                        for q in range(p + 1):
-                            A[p, q] += wp * basis[k, q]
-            trace = 0.0
-            for p in range(6):
-                trace += A[p, p]
-            for p in range(6):
-                A[p, p] += 1e-12 * trace
-            _solve_spd(A, b, solution)
-            residual = np.empty(count)
-            for k in range(count):
-                fitted = 0.0
-                for p in range(6):
-                    fitted += basis[k, p] * solution[p]
-                residual[k] = value[k] - middle - fitted
-            scale = 4.685 * 1.4826 * np.median(np.abs(residual)) + 1e-6
-            for k in range(count):
-                t = residual[k] / scale
-                robust[k] = (1 - t * t) ** 2 if abs(t) < 1 else 0.0
-        inliers = 0
-        for k in range(count):
-            if robust[k] > 0.1:
-                inliers += 1
+        inliers = _fit_quadratic(count, middle, basis, value, base, robust, solution)
         if inliers >= 0.5 * count:
-            out[i, 0] = solution[0] + middle
-            out[i, 1] = solution[1] / r
-            out[i, 2] = solution[2] / r
+            out[i, 0], out[i, 1], out[i, 2] = solution[0] + middle, solution[1] / r, solution[2] / r
+
+
+@kernel()
+def _collect_samples(field, weight, cu, cv, r, basis, value, base):  # type: ignore[no-untyped-def]
+    """Fill in the quadratic's terms, the values and the weights of a window's samples around pixel (cu, cv).
+
+    Returns their number; 0 where they are on one side only, or the window is not in the image.
+    """
+    if not (np.isfinite(cu) and np.isfinite(cv) and r > 1):
+        return 0
+    height, width = field.shape
+    stride = max(1, int(np.ceil(2 * r / 30)))
+    u0, u1 = max(0, int(np.ceil(cu - r))), min(width - 1, int(np.floor(cu + r)))
+    v0, v1 = max(0, int(np.ceil(cv - r))), min(height - 1, int(np.floor(cv + r)))
+    count = 0
+    mean_x = mean_y = 0.0
+    for v in range(v0, v1 + 1, stride):
+        for u in range(u0, u1 + 1, stride):
+            if weight[v, u] > 0 and count < MAX_SAMPLES:
+                x, y = (u - cu) / r, (v - cv) / r
+                terms = basis[count]
+                terms[0], terms[1], terms[2], terms[3], terms[4], terms[5] = 1.0, x, y, x * x, x * y, y * y
+                value[count], base[count] = field[v, u], weight[v, u]
+                mean_x += x
+                mean_y += y
+                count += 1
+    return 0 if np.hypot(mean_x, mean_y) > MAX_OFF_CENTRE * count else count
+
+
+@kernel()
+def _fit_quadratic(count, middle, basis, value, base, robust, solution):  # type: ignore[no-untyped-def]
+    """Fit ``solution`` (6,) to the first ``count`` values (k,) less ``middle``, with Tukey's weights.
+
+    ``basis`` (k, 6): the terms; ``base`` (k,): the weights. Fills ``robust`` (k,) with Tukey's, and returns the number
+    of inliers.
+    """
+    residual = np.empty(count)
+    robust[:count] = 1.0
+    for _ in range(5):
+        A, b = np.zeros((6, 6)), np.zeros(6)
+        for k in range(count):
+            w = base[k] * robust[k]
+            if w > 0:
+                for p in range(6):
+                    wp = w * basis[k, p]
+                    b[p] += wp * (value[k] - middle)
+                    for q in range(p + 1):
+                        A[p, q] += wp * basis[k, q]
+        trace = np.trace(A)
+        for p in range(6):
+            A[p, p] += 1e-12 * trace
+        _solve_spd(A, b, solution)
+        for k in range(count):
+            fitted = 0.0
+            for p in range(6):
+                fitted += basis[k, p] * solution[p]
+            residual[k] = value[k] - middle - fitted
+        scale = 4.685 * 1.4826 * np.median(np.abs(residual)) + 1e-6
+        for k in range(count):
+            t = residual[k] / scale
+            robust[k] = (1 - t * t) ** 2 if abs(t) < 1 else 0.0
+    return np.count_nonzero(robust[:count] > 0.1)

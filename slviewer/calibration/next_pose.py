@@ -10,16 +10,21 @@ from itertools import product
 
 import cv2
 import numpy as np
+from scipy.spatial.transform import Rotation
 
+from slviewer.calibration.board_pose import solve_pose
 from slviewer.errors import InputError
 from slviewer.geometry.lens import Lens
-from slviewer.geometry.rigid import move_points, rigid_transform, transform_from_rvec
+from slviewer.geometry.polynomial import grid_points
+from slviewer.geometry.rigid import move_points, rigid_transform
+from slviewer.geometry.vectors import box_middle, finite_rows, lengths
 from slviewer.target.board import Board
 
 COLUMNS, ROWS = 4, 3
 """Cells of the image."""
 THIRDS = ("near", "at middle distance", "far")
 TILTS = ("facing", "top away", "right away", "bottom away", "left away")
+_TILT_AXES = ((0, 0), (-1, 0), (0, -1), (1, 0), (0, 1))  # about which the board is turned for each
 FACING_DEG = 8.0
 """Tilts below count as facing the camera."""
 GOAL_POSES = 2
@@ -34,8 +39,13 @@ _NEAR_FILL, _DEPTH_RATIO = (
     1.45,
 )  # nearest: the squarely held board fills so much of the image; farthest: times this
 _CELL_SHARE = 0.5  # of a cell that the board must cover
+_REACH_MARGIN = 0.02  # of the projector's image, inside which points are reached
 _FREE = 0.015  # of the image's width, left free around the board
 _FINE = 5  # samples along each side of a cell
+
+
+Illumination = Callable[[np.ndarray], np.ndarray]
+"""Tells which points (n, 3) mm in the camera's frame the projector reaches, (n,) bool."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +80,7 @@ def nominal_lens(size: tuple[int, int], focal_px: float | None = None) -> Lens:
     """Return a lens without distortion; without `focal_px` a typical focal length is assumed."""
     width, height = size
     f = focal_px or NOMINAL_FOCAL * width
-    return Lens(np.array([[f, 0, (width - 1) / 2], [0, f, (height - 1) / 2], [0, 0, 1]]), np.zeros(5), size)
+    return Lens.from_parameters((f, f, (width - 1) / 2, (height - 1) / 2), size)
 
 
 def estimated_lens(points: Sequence[np.ndarray], pixels: Sequence[np.ndarray], size: tuple[int, int]) -> Lens:
@@ -90,16 +100,8 @@ def approximate_pose(points: np.ndarray, pixels: np.ndarray, lens: Lens) -> np.n
     """Estimate T_camera_board (4, 4) mm from points (n, 3) mm and pixels (n, 2); None where there is no solution."""
     if len(points) < 4:
         return None
-    try:
-        success, rvec, tvec = cv2.solvePnP(
-            np.asarray(points, float), np.asarray(pixels, float), lens.K, lens.D, flags=cv2.SOLVEPNP_IPPE
-        )
-    except cv2.error:
-        return None
-    if not (success and np.isfinite(rvec).all() and np.isfinite(tvec).all()):
-        return None
-    T = transform_from_rvec(rvec, tvec)
-    return T if T[2, 3] > 0 else None
+    T = solve_pose(points, pixels, lens.K, lens.D, cv2.SOLVEPNP_IPPE)
+    return None if T is None or T[2, 3] <= 0 else T
 
 
 def depth_range(board: Board, lens: Lens) -> tuple[float, float]:
@@ -109,7 +111,7 @@ def depth_range(board: Board, lens: Lens) -> tuple[float, float]:
     return near, _DEPTH_RATIO * near
 
 
-def coverage(board: Board, lens: Lens, poses: Sequence[np.ndarray]) -> Coverage:
+def count_coverage(board: Board, lens: Lens, poses: Sequence[np.ndarray]) -> Coverage:
     """Count how often `poses`, T_camera_board (4, 4) mm each, cover the cells, depths and tilts."""
     span = depth_range(board, lens)
     covered, thirds, tilts = _classify(board, lens, np.reshape(poses, (-1, 4, 4)), span)
@@ -127,7 +129,7 @@ def suggest(
     lens: Lens,
     poses: Sequence[np.ndarray],
     *,
-    illuminated: Callable[[np.ndarray], np.ndarray] | None = None,
+    illuminated: Illumination | None = None,
     skip: int = 0,
 ) -> Suggestion:
     """Suggest the pose that improves the coverage by `poses` most, with the whole board in view.
@@ -136,7 +138,7 @@ def suggest(
     is known (see `projector_reach`). `skip`: number of better suggestions to skip, which were refused before. Raises
     InputError where no pose shows the whole board.
     """
-    current = coverage(board, lens, poses)
+    current = count_coverage(board, lens, poses)
     candidates = _list_candidates(board, lens, current.range_mm, len(poses), illuminated)
     if not len(candidates):
         raise InputError(f"the board {board} cannot be held so that the camera sees all of it: take a smaller board")
@@ -151,7 +153,7 @@ def suggest(
         new, existing = (
             _describe_numerically(np.reshape(each, (-1, 4, 4)), board, current.range_mm) for each in (candidates, poses)
         )
-        distance = np.linalg.norm(new[:, None] - existing, axis=-1).min(axis=1)
+        distance = lengths(new[:, None] - existing).min(axis=1)
     order = np.argsort(-(gain + 0.2 * distance), kind="stable")
     return describe_suggestion(board, lens, candidates[order[skip % len(order)]])
 
@@ -163,15 +165,13 @@ def describe_suggestion(board: Board, lens: Lens, T_camera_board: np.ndarray) ->
     return Suggestion(T_camera_board, corners, _describe_pose(thirds[0], tilts[0], corners.mean(0), lens.size))
 
 
-def projector_reach(
-    points: np.ndarray, pixels: np.ndarray, size: tuple[int, int], margin: float = 0.02
-) -> Callable[[np.ndarray], np.ndarray] | None:
+def projector_reach(points: np.ndarray, pixels: np.ndarray, size: tuple[int, int]) -> Illumination | None:
     """Estimate the projector's field of view by linear resection (DLT) from points (n, 3) mm and pixels (n, 2).
 
     Points are in the camera's frame. Returns a function points (k, 3) mm -> (k,) bool, or None where the points do not
     determine the projection, as on a single plane.
     """
-    known = np.isfinite(pixels).all(1) & np.isfinite(points).all(1)
+    known = finite_rows(pixels, points)
     points, pixels = points[known], pixels[known]
     if len(points) < 12:
         return None
@@ -189,7 +189,7 @@ def projector_reach(
     def reaches(points: np.ndarray) -> np.ndarray:
         """(k,) bool: whether points (k, 3) mm project into the projector's image less a margin."""
         h = np.column_stack([(points - middle) / scale, np.ones(len(points))]) @ P.T
-        return (np.abs(h[:, :2] / h[:, 2:]) < 0.5 - margin).all(1)
+        return (np.abs(h[:, :2] / h[:, 2:]) < 0.5 - _REACH_MARGIN).all(1)
 
     return reaches if reaches(points).mean() > 0.8 else None
 
@@ -199,7 +199,7 @@ def _list_candidates(
     lens: Lens,
     span: tuple[float, float],
     count: int,
-    illuminated: Callable[[np.ndarray], np.ndarray] | None,
+    illuminated: Illumination | None,
 ) -> np.ndarray:
     """Return poses (k, 4, 4) at every depth, tilt and direction, each as far off-centre as the whole board is visible.
 
@@ -207,31 +207,27 @@ def _list_candidates(
     """
     angle = np.radians((18.0, 25.0, 14.0)[count % 3])
     near, far = span
-    middle = (board.points.min(0) + board.points.max(0)) / 2
+    middle = box_middle(board.points)
     # Before two poses have shown the projector's field of view, the middle of the image is most likely inside it.
     places = np.array(list(product((-1, 0, 1), repeat=2)) if illuminated is not None else [(0, 0)])
     shares = np.linspace(1, 0, 11)  # of the way from the image's middle to its border
     pixels = (np.array(lens.size) - 1) / 2 + shares[:, None] * (places * np.array(lens.size) / 2)[:, None]
     rays = np.concatenate([(pixels - lens.K[:2, 2]) / np.diag(lens.K)[:2], np.ones((*pixels.shape[:2], 1))], axis=-1)
     depths = near + (far - near) * (np.arange(3) + 0.5) / 3
-    R = np.array([_tilt_rotation(tilt, angle) for tilt in range(len(TILTS))])
+    R = Rotation.from_rotvec([(angle * x, angle * y, 0.0) for x, y in _TILT_AXES]).as_matrix()
     t = depths[:, None, None, None, None] * rays - (R @ middle)[:, None, None]
     T = rigid_transform(np.broadcast_to(R[:, None, None], (*t.shape, 3)), t)  # by depth, tilt, place and share
     visible = _is_visible(board, lens, T.reshape(-1, 4, 4), illuminated).reshape(t.shape[:-1])
     farthest = visible.argmax(axis=-1)
     far_enough = (shares[farthest] > 0.15) | (places == 0).all(axis=1)
     chosen = np.take_along_axis(T, farthest[..., None, None, None], axis=3)[..., 0, :, :]
-    return np.asarray(chosen[visible.any(axis=-1) & far_enough])
+    return chosen[visible.any(axis=-1) & far_enough]
 
 
-def _is_visible(
-    board: Board, lens: Lens, T: np.ndarray, illuminated: Callable[[np.ndarray], np.ndarray] | None
-) -> np.ndarray:
+def _is_visible(board: Board, lens: Lens, T: np.ndarray, illuminated: Illumination | None) -> np.ndarray:
     """(n,) bool: whether the board's outline at poses (n, 4, 4) is inside the image, with a margin, and illuminated."""
     corners = move_points(T, board.outline())
-    pixels = lens.project(corners)
-    free = _FREE * lens.size[0]
-    inside = np.asarray(((pixels > free) & (pixels < np.array(lens.size) - 1 - free)).all(axis=(1, 2)))
+    inside = np.asarray(lens.contains(lens.project(corners), _FREE * lens.size[0] + 0.5).all(axis=1))
     if illuminated is not None:
         inside[inside] = illuminated(corners[inside].reshape(-1, 3)).reshape(-1, corners.shape[1]).all(axis=1)
     return inside
@@ -241,8 +237,7 @@ def _classify(
     board: Board, lens: Lens, T: np.ndarray, span: tuple[float, float]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the covered cells (n, 3, 4) bool, third of the depths (n,), index in `TILTS` (n,) of poses (n, 4, 4)."""
-    u, v = np.meshgrid(*((np.arange(n * _FINE) + 0.5) / (n * _FINE) for n in (COLUMNS, ROWS)))
-    samples = np.stack([u, v], -1).reshape(-1, 2) * np.array(lens.size)
+    samples = grid_points(*((np.arange(n * _FINE) + 0.5) / (n * _FINE) for n in (COLUMNS, ROWS))) * np.array(lens.size)
     corners = outline_px(board, lens, T)[:, None]
     sides = np.roll(corners, -1, -2) - corners
     away = samples[:, None] - corners
@@ -264,12 +259,6 @@ def _classify_tilt(T: np.ndarray) -> np.ndarray:
     return np.where(facing, 0, tilted)
 
 
-def _tilt_rotation(tilt: int, angle: float) -> np.ndarray:
-    """Return the rotation (3, 3) of a tilt, by its index in `TILTS`, with an angle in rad."""
-    x, y = {0: (0, 0), 1: (-angle, 0), 2: (0, -angle), 3: (angle, 0), 4: (0, angle)}[tilt]
-    return cv2.Rodrigues(np.array([x, y, 0.0]))[0]
-
-
 def _describe_numerically(T: np.ndarray, board: Board, span: tuple[float, float]) -> np.ndarray:
     """Return descriptors (n, 5) of poses (n, 4, 4), to compare them: position, depth and tilt in units of about 1."""
     middle = _board_middle(T, board)
@@ -280,21 +269,13 @@ def _describe_numerically(T: np.ndarray, board: Board, span: tuple[float, float]
 
 def _board_middle(T: np.ndarray, board: Board) -> np.ndarray:
     """Return the middle (n, 3) mm of the board's features at poses (n, 4, 4), in the camera's frame."""
-    return move_points(T, ((board.points.min(0) + board.points.max(0)) / 2)[None])[:, 0]
+    return move_points(T, box_middle(board.points)[None])[:, 0]
 
 
 def _describe_pose(third: int, tilt: int, middle_px: np.ndarray, size: tuple[int, int]) -> str:
     """Return the instruction for a pose: its tilt, depth and position in the image in words."""
     across, down = middle_px / np.array(size) - 0.5
-    where = [
-        word
-        for word, here in (
-            ("top", down < -0.06),
-            ("bottom", down > 0.06),
-            ("left", across < -0.06),
-            ("right", across > 0.06),
-        )
-        if here
-    ]
+    words = {"top": down < -0.06, "bottom": down > 0.06, "left": across < -0.06, "right": across > 0.06}
+    where = " ".join(word for word, here in words.items() if here)
     attitude = "Face the camera squarely" if tilt == 0 else f"Tilt the {TILTS[tilt].removesuffix(' away')} away"
-    return f"{attitude}, {THIRDS[third]}, {'to the ' + ' '.join(where) if where else 'in the middle'}"
+    return f"{attitude}, {THIRDS[third]}, {f'to the {where}' if where else 'in the middle'}"

@@ -19,7 +19,9 @@ from slviewer.errors import DetectionError, InputError
 from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.polynomial import Polynomial2D, fit_polynomial
+from slviewer.geometry.rigid import Floats
 from slviewer.geometry.splines import SplineSurface, fit_spline
+from slviewer.geometry.vectors import lengths
 from slviewer.target.board import Board
 from slviewer.target.detect import Detection, board_mask
 
@@ -48,9 +50,9 @@ class Samples:
     (n, 2) px: their standard deviations predicted from the capture's noise. An axis that was not captured is NaN.
     """
 
-    camera: NDArray[np.float64]
-    projector: NDArray[np.float64]
-    sigma: NDArray[np.float64]
+    camera: Floats
+    projector: Floats
+    sigma: Floats
 
     def __post_init__(self) -> None:
         shapes = {a.shape for a in (self.camera, self.projector, self.sigma)}
@@ -120,8 +122,8 @@ class Observation:
     """
 
     name: str
-    points: NDArray[np.float64]
-    camera: NDArray[np.float64]
+    points: Floats
+    camera: Floats
     projector: np.ndarray
     surfaces: Mapping[Axis, SplineSurface | Polynomial2D]
     periods_px: Mapping[Axis, float]
@@ -140,7 +142,7 @@ class Observation:
         shape = (v1 - v0, u1 - u0)
         return np.unpackbits(self.packed_region, count=shape[0] * shape[1]).view(bool).reshape(shape)
 
-    def smoothed_phase(self, axis: Axis) -> NDArray[np.float64]:
+    def smoothed_phase(self, axis: Axis) -> Floats:
         """(v1 - v0, u1 - u0) float64 rad over ``box``: the smoothed absolute phase, NaN outside the region."""
         u0, v0, u1, v1 = self.box
         return np.where(self.region, self.surfaces[axis].evaluate_grid((v1 - v0, u1 - u0), (u0, v0)), np.nan)
@@ -195,8 +197,8 @@ class Observation:
             (left, top, right, bottom),
             arrays["region"],
             arrays.get("slopes"),
-            float(arrays["radius_mm"]) if "radius_mm" in arrays else 0.0,
-            bool(arrays["marked"]) if "marked" in arrays else False,
+            float(arrays.get("radius_mm", 0.0)),
+            bool(arrays.get("marked", False)),
             Samples(*(arrays[f"samples_{name}"] for name in Samples.__annotations__))
             if "samples_camera" in arrays
             else None,
@@ -261,16 +263,16 @@ def observe(
     )
 
 
-def pitch_px(board: Board, detection: Detection) -> NDArray[np.float64]:
+def pitch_px(board: Board, detection: Detection) -> Floats:
     """Return the board's pitch (n,) in camera px at each feature."""
     points = board.points[detection.ids][:, :2]
     H, _ = cv2.findHomography(points, np.asarray(detection.pixels, float))
     half = board.pitch_mm / 2
-    lengths = []
+    sides = []
     for step in (np.array([half, 0.0]), np.array([0.0, half])):
         ahead, behind = (cv2.perspectiveTransform((points + s)[None], H)[0] for s in (step, -step))
-        lengths.append(np.linalg.norm(ahead - behind, axis=1))
-    return np.minimum(*lengths)
+        sides.append(lengths(ahead - behind))
+    return np.minimum(*sides)
 
 
 def _projector_pixels(
@@ -293,7 +295,7 @@ def _projector_pixels(
 def _phase_weight(phase: PhaseMap, bright: np.ndarray) -> np.ndarray:
     """Return weights (h, w): the inverse variance of the phase of bright pixels over its maximum, else 0."""
     weight = np.where(bright, 1.0 / np.maximum(phase.sigma_phase, 1e-6) ** 2, 0.0)
-    return np.asarray(weight / max(float(weight.max()), 1e-30))
+    return weight / max(float(weight.max()), 1e-30)
 
 
 def smooth_axes(

@@ -9,9 +9,11 @@ from slviewer.calibration.pixelwise import PixelwiseModel
 from slviewer.calibration.splined.fields import Device, undistort
 from slviewer.calibration.splined.model import SplinedModel
 from slviewer.calibration.splined.unknowns import pinhole_lens
-from slviewer.calibration.splined.volume import is_supported
+from slviewer.calibration.splined.volume import in_illuminated_cells
 from slviewer.errors import InputError
 from slviewer.geometry.lens import Lens
+from slviewer.geometry.polynomial import grid_points
+from slviewer.geometry.vectors import finite_rows, lengths, rms
 
 GRID = 80
 """Number of pixels across the image in the fit: several per cell of a displacement field."""
@@ -43,9 +45,8 @@ def pixelwise_residuals(model: PixelwiseModel, lens: Lens) -> PinholeFit:
     """Measure the residuals of a ``lens`` on the pixelwise model's rays (c3, c4) of the camera pixels."""
     coefficients = model.fits[model.depth_axis].coefficients
     step = max(1, coefficients.shape[2] // GRID)
-    v, u = np.mgrid[: coefficients.shape[1] : step, : coefficients.shape[2] : step]
-    pixels = np.column_stack([u.ravel(), v.ravel()]).astype(float)
-    return _measure_residuals(lens, pixels, coefficients[3:5, v.ravel(), u.ravel()].T)
+    pixels = grid_points(*(np.arange(0, n, step) for n in coefficients.shape[:0:-1]))
+    return _measure_residuals(lens, pixels, coefficients[3:5, ::step, ::step].reshape(2, -1).T)
 
 
 def fit_lens(pixels: np.ndarray, rays: np.ndarray, start: Lens) -> PinholeFit:
@@ -53,36 +54,29 @@ def fit_lens(pixels: np.ndarray, rays: np.ndarray, start: Lens) -> PinholeFit:
 
     ``start``: initial lens. Rows with NaN are ignored; raises InputError where fewer than 50 remain.
     """
-    known = np.isfinite(rays).all(axis=1) & np.isfinite(pixels).all(axis=1)
+    known = finite_rows(rays, pixels)
     if np.count_nonzero(known) < MIN_PIXELS:
         raise InputError(f"{np.count_nonzero(known)} pixels are calibrated: a lens needs at least {MIN_PIXELS}")
     observed, directions = pixels[known], rays[known]
 
-    def lens(numbers: np.ndarray) -> Lens:
-        """Return the lens with these parameters: fx, fy, cx, cy, and the five distortion coefficients."""
-        fx, fy, cx, cy = numbers[:4]
-        return Lens(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]), numbers[4:], start.size)
-
     def residuals(numbers: np.ndarray) -> np.ndarray:
-        """Return the residuals (2 n,) px of a lens with these parameters."""
-        return np.nan_to_num(lens(numbers).distort(directions) - observed, nan=1e3).ravel()
+        """Return the residuals (2 n,) px of a lens with these nine parameters."""
+        return np.nan_to_num(Lens.from_parameters(numbers, start.size).distort(directions) - observed, nan=1e3).ravel()
 
     K = start.K
-    first = np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2], *start.D])
+    first = start.parameters[:9]
     scale = np.array([K[0, 0], K[1, 1], K[0, 0], K[1, 1], 0.1, 0.1, 0.01, 0.01, 0.1])
     solved = least_squares(residuals, first, x_scale=scale, xtol=1e-12, ftol=1e-12)
-    return _measure_residuals(lens(solved.x), pixels, rays)
+    return _measure_residuals(Lens.from_parameters(solved.x, start.size), pixels, rays)
 
 
 def _measure_residuals(lens: Lens, pixels: np.ndarray, rays: np.ndarray) -> PinholeFit:
     """Measure the residuals of a lens at pixels (n, 2) with known rays (n, 2); rows with NaN are ignored."""
-    length = np.linalg.norm(lens.distort(rays) - pixels, axis=1)
+    length = lengths(lens.distort(rays) - pixels)
     known = np.isfinite(length)
     if not known.any():
         return PinholeFit(lens, np.nan, np.nan, 0.0)
-    return PinholeFit(
-        lens, float(np.sqrt(np.mean(length[known] ** 2))), float(length[known].max()), float(known.mean())
-    )
+    return PinholeFit(lens, rms(length[known]), float(length[known].max()), float(known.mean()))
 
 
 def _fit_device(device: Device, illuminated: np.ndarray) -> PinholeFit:
@@ -90,7 +84,6 @@ def _fit_device(device: Device, illuminated: np.ndarray) -> PinholeFit:
     width, height = device.size
     across = np.linspace(0, width - 1, GRID)
     down = np.linspace(0, height - 1, max(2, round(GRID * height / width)))
-    u, v = np.meshgrid(across, down)
-    pixels = np.column_stack([u.ravel(), v.ravel()])
-    rays = np.where(is_supported(device, pixels, illuminated)[:, None], undistort(device, pixels), np.nan)
+    pixels = grid_points(across, down)
+    rays = np.where(in_illuminated_cells(device, pixels, illuminated)[:, None], undistort(device, pixels), np.nan)
     return fit_lens(pixels, rays, pinhole_lens(device))

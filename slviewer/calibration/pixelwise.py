@@ -19,6 +19,7 @@ from slviewer.errors import CalibrationRejected
 from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.jit import kernel
+from slviewer.geometry.rigid import Floats
 from slviewer.geometry.shapes import Plane, fit_plane
 from slviewer.geometry.triangulation import MARGIN, depth_per_px, ray_depth, triangulate_pixels
 
@@ -40,7 +41,7 @@ class PixelFit:
     and ``phase_max`` (h, w) rad: their phase range; ``condition`` (h, w): condition number of the fit of eq. 9.
     """
 
-    coefficients: NDArray[np.float64]
+    coefficients: Floats
     rms_mm: NDArray[np.float32]
     poses: NDArray[np.uint16]
     phase_min: NDArray[np.float32]

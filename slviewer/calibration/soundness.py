@@ -5,19 +5,23 @@ from collections.abc import Mapping, Sequence
 import cv2
 import numpy as np
 
+from slviewer.calibration.next_pose import nominal_lens
 from slviewer.calibration.observe import Observation
 from slviewer.errors import CalibrationRejected
+from slviewer.geometry.polynomial import fit_slopes
+from slviewer.geometry.rigid import largest_angle_deg
+from slviewer.geometry.vectors import unit_vectors
 
 MIN_POSES = 3
 MIN_TILT_SPREAD_DEG = 4.0
 
 
-def check_pose_count(used: Sequence[Observation], excluded: Mapping[str, str]) -> None:
+def check_pose_count(count: int, excluded: Mapping[str, str]) -> None:
     """Raise CalibrationRejected for fewer than MIN_POSES poses; the message lists the ``excluded`` ones."""
-    if len(used) < MIN_POSES:
+    if count < MIN_POSES:
         why = "".join(f"; {name}: {reason}" for name, reason in excluded.items())
         raise CalibrationRejected(
-            f"{len(used)} usable pose{'s' * (len(used) != 1)}, and at least {MIN_POSES} are needed: "
+            f"{count} usable pose{'s' * (count != 1)}, and at least {MIN_POSES} are needed: "
             f"capture the board in more positions and tilts{why}"
         )
 
@@ -39,17 +43,11 @@ def nominal_tilt_spread_deg(used: Sequence[Observation]) -> float:
     """Estimate the largest angle in degrees between two boards with a nominal lens; 0 for fewer than two boards."""
     normals = []
     for o in used:
-        width, height = o.size
         H, _ = cv2.findHomography(o.points[:, :2], o.camera)
         line = np.linalg.inv(H).T @ np.array([0.0, 0.0, 1.0])
-        f = 1.5 * width
-        nominal = np.array([[f, 0, (width - 1) / 2], [0, f, (height - 1) / 2], [0, 0, 1.0]])
-        normal = nominal.T @ line
-        normals.append(normal / np.linalg.norm(normal) * np.sign(normal[2] or 1))
-    if len(normals) < 2:
-        return 0.0
-    cosines = np.clip(np.array(normals) @ np.array(normals).T, -1, 1)
-    return float(np.degrees(np.arccos(cosines.min())))
+        normal = nominal_lens(o.size).K.T @ line
+        normals.append(unit_vectors(normal) * np.sign(normal[2] or 1))
+    return largest_angle_deg(np.array(normals)) if len(normals) > 1 else 0.0
 
 
 def check_handedness(used: Sequence[Observation]) -> None:
@@ -64,6 +62,4 @@ def check_handedness(used: Sequence[Observation]) -> None:
 
 def _handedness(points: np.ndarray, pixels: np.ndarray) -> float:
     """Return the determinant of the affine map from board points (n, 3) mm to pixels (n, 2): negative if mirrored."""
-    measured = np.isfinite(pixels).all(1)
-    design = np.column_stack([points[measured, :2], np.ones(np.count_nonzero(measured))])
-    return float(np.linalg.det(np.linalg.lstsq(design, pixels[measured], rcond=None)[0][:2]))
+    return float(np.linalg.det(fit_slopes(points[:, :2], pixels)))

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from slviewer.calibration.board_pose import CRITERIA, solve_device
 from slviewer.calibration.observe import Observation
 from slviewer.calibration.soundness import check_handedness, check_pose_count, check_tilts
 from slviewer.errors import CalibrationRejected
@@ -18,6 +19,7 @@ from slviewer.geometry.rig import StereoRig
 from slviewer.geometry.rigid import Floats, move_points, transform_from_rvec
 from slviewer.geometry.triangulation import depth_per_px, points_from_depth, triangulate
 from slviewer.records.plain import from_plain, to_plain
+from slviewer.geometry.vectors import finite_rows, lengths, rms_length
 
 MIN_FEATURES = 12
 MAX_FOCAL_SIGMA = 0.05
@@ -25,7 +27,6 @@ MAX_FOCAL_SIGMA = 0.05
 MAX_REPROJECTION_PX = 2.0
 """Above this the features and the model do not belong together, whatever the cause."""
 ROBUST_SIGMAS = 6.0
-ITERATIONS = 200
 _SAVED_KEYS = {"excluded": "left_out", "features_excluded": "features_set_aside"}
 """Keys on disk of the fields whose names differ from them."""
 
@@ -78,9 +79,7 @@ class StereoModel:
         magnification = self.rig.projector.K[1, 1] / self.rig.camera.K[1, 1]
         return float(np.hypot(rms["projector"], magnification * rms["camera"]) / np.sqrt(2))  # of one coordinate
 
-    def undistort_pairs(
-        self, camera_pixels: NDArray[np.float64], projector_pixels: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def undistort_pairs(self, camera_pixels: Floats, projector_pixels: Floats) -> tuple[Floats, Floats]:
         """Return the undistorted normalised coordinates (n, 2) of camera pixels (n, 2) and of projector pixels (n, 2).
 
         NaN where the inversion of the distortion fails.
@@ -138,7 +137,7 @@ def calibrate_stereo(
     excluded = dict(excluded or {})
     inliers: dict[str, NDArray[np.bool_]] = {}
     for observation in observations:
-        measured = np.isfinite(observation.projector).all(1) & np.isfinite(observation.camera).all(1)
+        measured = finite_rows(observation.projector, observation.camera)
         if len(observation.surfaces) < 2:
             only = ", ".join(observation.surfaces)
             excluded[observation.name] = f"holds the {only} axis alone: a calibration pose needs both x and y"
@@ -150,7 +149,7 @@ def calibrate_stereo(
         else:
             inliers[observation.name] = measured
     used = [o for o in observations if o.name in inliers]
-    check_pose_count(used, excluded)
+    check_pose_count(len(used), excluded)
     if strict:
         check_handedness(used)
         check_tilts(used)
@@ -168,7 +167,7 @@ def calibrate_stereo(
                     "was the board moved during the capture, or its grid shifted?"
                 )
                 used = [o for o in used if o.name != name]
-        check_pose_count(used, excluded)
+        check_pose_count(len(used), excluded)
     else:  # the last round excluded features or poses too
         solution = _Solution.fit(used, inliers, projector_size, strict)
     model = solution.to_model(used, inliers, board, excluded)
@@ -182,7 +181,7 @@ class _Solution:
     """Result of ``cv2.stereoCalibrate``: the rig, T_camera_board (4, 4) mm of each pose, focal sigmas by device."""
 
     rig: StereoRig
-    poses: list[Floats]
+    poses: dict[str, Floats]
     focal_sigma_px: dict[str, float]
 
     @classmethod
@@ -198,30 +197,22 @@ class _Solution:
         Raises CalibrationRejected where OpenCV finds no solution or a focal length is not positive, and if ``strict``
         where one is too uncertain.
         """
-        objects = [o.points[inliers[o.name]].astype(np.float32) for o in used]
-        cameras = [o.camera[inliers[o.name]].astype(np.float32) for o in used]
-        projectors = [o.projector[inliers[o.name]].astype(np.float32) for o in used]
-        criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, ITERATIONS, 1e-9)
+        objects, cameras, projectors = (
+            [getattr(o, name)[inliers[o.name]].astype(np.float32) for o in used]
+            for name in ("points", "camera", "projector")
+        )
         sigma: dict[str, float] = {}
         intrinsics = []
         for device, images, size in (("camera", cameras, used[0].size), ("projector", projectors, projector_size)):
-            try:
-                _, K, D, _, _, deviations, _, _ = cv2.calibrateCameraExtended(
-                    objects, images, size, np.zeros((3, 3)), np.zeros(5), criteria=criteria
-                )
-            except cv2.error as error:
-                raise CalibrationRejected(
-                    f"the {device}'s lens could not be solved from {len(used)} poses: "
-                    f"capture the board in more positions and tilts ({error.err})"
-                ) from error
-            sigma[device] = float(np.max(deviations.ravel()[:2]))
+            K, D, _, sigmas = solve_device(device, objects, images, size)
+            sigma[device] = max(sigmas)
             relative = sigma[device] / float(min(K[0, 0], K[1, 1]))
             if strict and not relative < MAX_FOCAL_SIGMA:
                 raise CalibrationRejected(
                     f"the poses leave the {device}'s focal length uncertain by {100 * relative:.0f} %: "
                     "tilt the board by 15 to 30 degrees in different directions, and vary its distance"
                 )
-            intrinsics.append((K, D.ravel()[:5]))
+            intrinsics.append((K, D))
         (K_c, D_c), (K_p, D_p) = intrinsics
         _, K_c, D_c, K_p, D_p, R, T, _, _, rvecs, tvecs, _ = cv2.stereoCalibrateExtended(
             objects,
@@ -235,7 +226,7 @@ class _Solution:
             np.eye(3),
             np.zeros((3, 1)),
             flags=cv2.CALIB_USE_INTRINSIC_GUESS,
-            criteria=criteria,
+            criteria=CRITERIA,
         )
         for device, K in (("camera", K_c), ("projector", K_p)):
             if not min(K[0, 0], K[1, 1]) > 0:
@@ -246,12 +237,12 @@ class _Solution:
                 )
         camera = Lens(np.array(K_c), np.array(D_c).ravel()[:5], used[0].size)
         projector = Lens(np.array(K_p), np.array(D_p).ravel()[:5], projector_size)
-        poses = [transform_from_rvec(rvec, tvec) for rvec, tvec in zip(rvecs, tvecs, strict=True)]
+        poses = {o.name: transform_from_rvec(r, t) for o, r, t in zip(used, rvecs, tvecs, strict=True)}
         return cls(StereoRig(camera, projector, np.array(R), np.array(T)), poses, sigma)
 
-    def residuals(self, index: int, observation: Observation) -> Floats:
+    def residuals(self, observation: Observation) -> Floats:
         """Return the camera and projector residuals (n, 4) px of every feature of one pose."""
-        X = move_points(self.poses[index], observation.points)
+        X = move_points(self.poses[observation.name], observation.points)
         predicted = self.rig.camera.project(X), self.rig.project(X)
         return np.hstack([observation.camera - predicted[0], observation.projector - predicted[1]])
 
@@ -263,10 +254,8 @@ class _Solution:
         excluded: Mapping[str, str],
     ) -> StereoModel:
         """Return the calibrated model with the reprojection errors of the inlier features."""
-        residuals = {
-            o.name: np.where(inliers[o.name][:, None], self.residuals(i, o), np.nan) for i, o in enumerate(used)
-        }
-        z = np.concatenate([move_points(T, o.points)[:, 2] for T, o in zip(self.poses, used, strict=True)])
+        residuals = {o.name: np.where(inliers[o.name][:, None], self.residuals(o), np.nan) for o in used}
+        z = np.concatenate([move_points(self.poses[o.name], o.points)[:, 2] for o in used])
         all_residuals = np.concatenate(list(residuals.values()))
         rms = {"camera": rms_length(all_residuals[:, :2]), "projector": rms_length(all_residuals[:, 2:])}
         rms["stereo"] = float(np.sqrt((rms["camera"] ** 2 + rms["projector"] ** 2) / 2))
@@ -275,7 +264,7 @@ class _Solution:
             board=board,
             axes=("x", "y"),
             reprojection_rms_px=rms,
-            poses={o.name: T for o, T in zip(used, self.poses, strict=True)},
+            poses=self.poses,
             pose_rms_px={name: (rms_length(r[:, :2]), rms_length(r[:, 2:])) for name, r in residuals.items()},
             excluded=excluded,
             depth_range_mm=(float(z.min()), float(z.max())),
@@ -298,11 +287,6 @@ def _check_agreement(model: StereoModel) -> None:
         raise CalibrationRejected("the solution puts the board behind the camera: check the target's notation")
 
 
-def rms_length(residuals: np.ndarray) -> float:
-    """Return the root mean square length of 2-D residuals (n, 2), as OpenCV reports it; rows with NaN do not count."""
-    return float(np.sqrt(np.nanmean(np.sum(residuals**2, axis=1))))
-
-
 def _detect_outliers(
     solution: _Solution, used: Sequence[Observation], inliers: Mapping[str, NDArray[np.bool_]]
 ) -> dict[str, NDArray[np.bool_]]:
@@ -310,11 +294,8 @@ def _detect_outliers(
 
     An outlier's residual exceeds ROBUST_SIGMAS times the robust sigma of all features, in either device.
     """
-    lengths = {}
-    for i, o in enumerate(used):
-        r = solution.residuals(i, o)
-        lengths[o.name] = np.stack([np.hypot(r[:, 0], r[:, 1]), np.hypot(r[:, 2], r[:, 3])], axis=1)
-    sigma = np.median(np.concatenate([lengths[o.name][inliers[o.name]] for o in used]), axis=0) / 1.1774  # Rayleigh
+    errors = {o.name: lengths(solution.residuals(o).reshape(-1, 2, 2)) for o in used}  # in the camera and projector
+    sigma = np.median(np.concatenate([errors[o.name][inliers[o.name]] for o in used]), axis=0) / 1.1774  # Rayleigh
     limit = np.maximum(ROBUST_SIGMAS * sigma, 0.05)
-    outliers = {o.name: inliers[o.name] & (lengths[o.name] > limit).any(1) for o in used}
+    outliers = {o.name: inliers[o.name] & (errors[o.name] > limit).any(1) for o in used}
     return {name: is_outlier for name, is_outlier in outliers.items() if is_outlier.any()}

@@ -20,6 +20,7 @@ from slviewer.fringe.sequence import Axis
 from slviewer.geometry.rig import StereoRig
 from slviewer.geometry.rigid import fit_rigid, move_points
 from slviewer.geometry.shapes import fit_plane
+from slviewer.geometry.vectors import finite_rows, rms, rms_length
 from slviewer.reconstruction.reconstruct import Model
 from slviewer.records.plain import to_plain
 
@@ -65,7 +66,7 @@ class CrossValidation:
 
     def rms(self, model: str, figure: str) -> float:
         """Root mean square over the poses of one figure of `HeldOut`."""
-        return float(np.sqrt(np.mean([getattr(pose, figure) ** 2 for pose in self.poses[model].values()])))
+        return rms([getattr(pose, figure) for pose in self.poses[model].values()])
 
     @property
     def recommended(self) -> str:
@@ -159,7 +160,7 @@ def measure_held_out(
         name: _interpolate(np.where(common[..., None], points, np.nan), observation.camera)
         for name, points in clouds.items()
     }
-    read = np.logical_and.reduce([np.isfinite(X).all(1) for X in features.values()])
+    read = finite_rows(*features.values())
     if np.count_nonzero(read) < LEAST_FEATURES:
         return {}
     board = observation.points[read]
@@ -168,11 +169,11 @@ def measure_held_out(
         measured, X = points[common].astype(float), features[name][read]
         placed, scale = _align_board(board, X)
         results[name] = HeldOutPose(
-            plane_mm=float(np.sqrt(np.mean(fit_plane(measured).distance(measured) ** 2))),
-            board_mm=_rms_length(X - placed),
+            plane_mm=rms(fit_plane(measured).distance(measured)),
+            board_mm=rms_length(X - placed),
             scale_ppm=1e6 * (scale - 1),
-            camera_px=_rms_length(rig.camera.project(X) - rig.camera.project(placed)),
-            projector_px=_rms_length(rig.project(X) - rig.project(placed)),
+            camera_px=rms_length(rig.camera.project(X) - rig.camera.project(placed)),
+            projector_px=rms_length(rig.project(X) - rig.project(placed)),
             pixels=len(measured),
             depth_mm=float(X[:, 2].mean()),
         )
@@ -212,8 +213,3 @@ def _align_board(board: np.ndarray, measured: np.ndarray) -> tuple[np.ndarray, f
     laid, middle = move_points(fit_rigid(board, measured), board), measured.mean(0)
     scale = float(np.sum((laid - middle) * (measured - middle)) / np.sum((laid - middle) ** 2))
     return laid, scale
-
-
-def _rms_length(differences: np.ndarray) -> float:
-    """Return the root mean square length of differences (n, 3)."""
-    return float(np.sqrt(np.mean(np.sum(differences**2, axis=1))))

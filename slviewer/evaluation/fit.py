@@ -9,6 +9,7 @@ import numpy as np
 from slviewer.errors import InputError
 from slviewer.geometry.robust import robust_sigma
 from slviewer.geometry.shapes import Plane, Sphere
+from slviewer.geometry.vectors import finite_rows, rms, unit_vectors
 
 Fitted = TypeVar("Fitted", Plane, Sphere)
 
@@ -85,10 +86,10 @@ def within_sigmas(residuals: np.ndarray, points: np.ndarray) -> np.ndarray:
     exact points it is nothing but rounding, which excludes none of them.
     """
     reach = max(SET_ASIDE_SIGMA * robust_sigma(residuals), 1e-9 * float(np.abs(points).max()))
-    return np.asarray(np.abs(residuals - np.median(residuals)) <= reach)
+    return np.abs(residuals - np.median(residuals)) <= reach
 
 
-def measure(
+def fit_shape(
     points: np.ndarray,
     mask: np.ndarray,
     sigma_z: np.ndarray | None,
@@ -96,7 +97,7 @@ def measure(
     fit: Callable[[np.ndarray], Fitted],
 ) -> tuple[Fitted, ShapeResult]:
     """Fit the shape to the measured pixels under ``mask`` of a cloud ``(h, w, 3)``, and evaluate the residuals."""
-    looked_at = mask & np.isfinite(points).all(axis=2)
+    looked_at = mask & finite_rows(points)
     chosen = points[looked_at].astype(np.float64)
     if len(chosen) < LEAST_POINTS:
         raise InputError(f"{len(chosen)} points were measured in the region: at least {LEAST_POINTS} are needed.")
@@ -108,8 +109,8 @@ def measure(
     inliers = np.zeros(points.shape[:2], dtype=bool)
     inliers[looked_at] = is_inlier
     floor = float("nan") if sigma_z is None else noise_floor(shape, chosen[is_inlier], sigma_z[inliers])
-    rms = float(np.sqrt(np.mean(residuals[is_inlier] ** 2)))
-    return shape, ShapeResult(rms, floor, len(chosen), int(np.count_nonzero(~is_inlier)), error_map, inliers)
+    error = rms(residuals[is_inlier])
+    return shape, ShapeResult(error, floor, len(chosen), int(np.count_nonzero(~is_inlier)), error_map, inliers)
 
 
 def noise_floor(shape: Plane | Sphere, points: np.ndarray, sigma_z: np.ndarray) -> float:
@@ -125,5 +126,5 @@ def noise_floor(shape: Plane | Sphere, points: np.ndarray, sigma_z: np.ndarray) 
     if isinstance(shape, Plane):
         along = rays @ shape.normal
     else:
-        along = np.sum((points - shape.centre) / np.linalg.norm(points - shape.centre, axis=1)[:, None] * rays, axis=1)
-    return float(np.sqrt(np.mean((sigma_z * along) ** 2)))
+        along = np.sum(unit_vectors(points - shape.centre) * rays, axis=1)
+    return rms(sigma_z * along)

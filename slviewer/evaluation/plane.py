@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slviewer.evaluation.fit import ShapeResult, measure
+from slviewer.evaluation.fit import ShapeResult, fit_shape
 from slviewer.evaluation.region import find_plane, start_plane
 from slviewer.geometry.shapes import Plane, fit_plane
 
@@ -28,5 +28,5 @@ def evaluate_plane(
         start, mask = find_plane(points, sigma_z=sigma_z)
     elif start is None:
         start = start_plane(points, mask, sigma_z)
-    plane, result = measure(points, mask, sigma_z, start, fit_plane)
+    plane, result = fit_shape(points, mask, sigma_z, start, fit_plane)
     return PlaneResult(**vars(result), plane=plane)

@@ -15,6 +15,7 @@ from slviewer.errors import InputError
 from slviewer.evaluation.fit import Fitted
 from slviewer.geometry.ransac import ransac_plane, ransac_sphere
 from slviewer.geometry.shapes import Plane, Sphere, fit_plane, fit_sphere
+from slviewer.geometry.vectors import finite_rows
 
 RANSAC_TOLERANCE_MM = 1.0  # or twice the noise
 PATCH_TOLERANCE_MM = 3.0  # or six times the noise
@@ -25,21 +26,17 @@ _SAMPLE = 40_000
 
 
 def find_plane(
-    points: np.ndarray,
-    mask: np.ndarray | None = None,
-    sigma_z: np.ndarray | None = None,
-    start: Plane | None = None,
+    points: np.ndarray, sigma_z: np.ndarray | None = None, start: Plane | None = None
 ) -> tuple[Plane, np.ndarray]:
     """Detect the plane with most pixels of a cloud ``(h, w, 3)``, and its region ``(h, w)`` bool.
 
-    ``mask`` leaves only some pixels to search in; ``sigma_z`` ``(h, w)`` mm is the expected noise. The region is one
-    patch without its outermost two pixels; isolated pixels and small holes inside it belong to it, whether something
-    was measured there or not. A roughly known plane to ``start`` from spares the search. The plane that comes back is a
-    start for fits, not a result. Raises ``InputError`` where no plane fills a patch.
+    ``sigma_z`` ``(h, w)`` mm is the expected noise. The region is one patch without its outermost two pixels; isolated
+    pixels and small holes inside it belong to it, whether something was measured there or not. A roughly known plane to
+    ``start`` from spares the search. The plane that comes back is a start for fits, not a result. Raises ``InputError``
+    where no plane fills a patch.
     """
-    measured = measured_pixels(points, mask)
-    noise = _typical_noise(sigma_z, measured)
-    reach = max(PATCH_TOLERANCE_MM, 6.0 * noise)
+    measured = measured_pixels(points, None)
+    reach = max(PATCH_TOLERANCE_MM, 6.0 * _typical_noise(sigma_z, measured))
     first = start or start_plane(points, measured, sigma_z)
     return _grow_patch(points, measured, first, fit_plane, lambda shape: reach, "flat")
 
@@ -79,9 +76,8 @@ def find_spheres(
 def start_plane(points: np.ndarray, mask: np.ndarray, sigma_z: np.ndarray | None = None) -> Plane:
     """Estimate the plane that most points under ``mask`` agree with, by RANSAC."""
     measured = measured_pixels(points, mask)
-    return ransac_plane(
-        sample_points(points, measured), max(RANSAC_TOLERANCE_MM, 2.0 * _typical_noise(sigma_z, measured))
-    )[0]
+    tolerance = max(RANSAC_TOLERANCE_MM, 2.0 * _typical_noise(sigma_z, measured))
+    return ransac_plane(sample_points(points, measured), tolerance)[0]
 
 
 def start_sphere(
@@ -110,7 +106,7 @@ def measured_pixels(points: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
         raise InputError(f"The cloud has shape {points.shape}: an organised cloud (h, w, 3) is needed.")
     if mask is not None and mask.shape != points.shape[:2]:
         raise InputError(f"The mask has shape {mask.shape} and the cloud {points.shape[:2]}: they must agree.")
-    measured: np.ndarray = np.isfinite(points).all(axis=2)
+    measured = finite_rows(points)
     measured = measured if mask is None else measured & mask
     if np.count_nonzero(measured) < LEAST_PIXELS:
         raise InputError(
@@ -167,8 +163,7 @@ def _largest_patch(agreeing: np.ndarray) -> np.ndarray:
     inside = (stats[:, 0] > 0) & (stats[:, 1] > 0) & (stats[:, 0] + stats[:, 2] < w) & (stats[:, 1] + stats[:, 3] < h)
     holes = small & inside
     holes[0] = False  # label 0 is the patch itself
-    filled: np.ndarray = patch | holes[labels]
-    return filled
+    return patch | holes[labels]
 
 
 def _remove_rim(patch: np.ndarray) -> np.ndarray:

@@ -9,10 +9,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from slviewer.calibration.next_pose import nominal_lens
 from slviewer.errors import InputError
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.rig import StereoRig
 from slviewer.geometry.triangulation import depth_per_px
+from slviewer.geometry.vectors import lengths, unit_vectors
 
 PEAK_LEVEL, DARK_LEVEL, FULL_LEVEL = 215.0, 3.0, 255.0
 """Grey levels of a white surface, as the rig check sets the exposure; without light; and the highest."""
@@ -107,24 +109,21 @@ class PlannedLight:
 def place(camera: PlannedCamera, projector: PlannedProjector, distance: float, baseline: float) -> StereoRig:
     """Return the rig whose projector stands ``baseline`` mm to the right of the camera, its picture's middle on the
     camera's axis at ``distance`` mm."""
-    width, height = camera.size
-    K = np.array([[camera.focal_px, 0, (width - 1) / 2], [0, camera.focal_px, (height - 1) / 2], [0, 0, 1]])
     columns, rows = projector.size
     fx, fy = projector.focal_px
     # rows count downwards: the axis meets the picture's plane below its middle
-    K_p = np.array([[fx, 0, (columns - 1) / 2], [0, fy, (rows - 1) / 2 + projector.offset * rows], [0, 0, 1]])
+    lens = Lens.from_parameters((fx, fy, (columns - 1) / 2, (rows - 1) / 2 + projector.offset * rows), projector.size)
     centre = np.array([baseline, 0.0, 0.0])
     aim = np.array([0.0, 0.0, distance]) - centre
-    z = aim / np.linalg.norm(aim)
-    x = np.cross([0.0, 1.0, 0.0], z)
-    x /= np.linalg.norm(x)
+    z = unit_vectors(aim)
+    x = unit_vectors(np.cross([0.0, 1.0, 0.0], z))
     R = np.stack([x, np.cross(z, x), z])
     tilt = np.arctan(projector.offset * rows / fy)  # so that the picture's middle, not the axis, is aimed
     R = np.array([[1, 0, 0], [0, np.cos(tilt), -np.sin(tilt)], [0, np.sin(tilt), np.cos(tilt)]]) @ R
-    return StereoRig(Lens(K, np.zeros(5), camera.size), Lens(K_p, np.zeros(5), projector.size), R, -R @ centre)
+    return StereoRig(nominal_lens(camera.size, camera.focal_px), lens, R, -R @ centre)
 
 
-def plan_rig(
+def predict_rig(
     camera: PlannedCamera,
     projector: PlannedProjector,
     distance: float,
@@ -198,10 +197,7 @@ def _plane_points(rig: StereoRig, z: float) -> np.ndarray:
 
 def _is_illuminated(rig: StereoRig, z: float) -> np.ndarray:
     """Return which camera pixels (h, w) see the projector's picture on the plane at depth z."""
-    pixels = rig.project(_plane_points(rig, z))
-    with np.errstate(invalid="ignore"):
-        inside = (pixels > -0.5) & (pixels < np.array(rig.projector.size) - 0.5)
-    return np.asarray(inside.all(axis=2))
+    return rig.projector.contains(rig.project(_plane_points(rig, z)))
 
 
 @dataclass(frozen=True)
@@ -227,8 +223,7 @@ class _Optics:
         of_camera = camera.focal_px * camera.aperture_mm / 4 * (1 / z - 1 / self.focus)
         columns_per_px = (z / camera.focal_px) / (depths / projector.focal_px[0])
         camera_sigma = np.sqrt(camera.blur_px**2 + of_camera**2 + 1 / 12) * columns_per_px
-        blur: np.ndarray = np.sqrt(projector.blur_px**2 + of_projector**2 + 1 / 12 + camera_sigma**2)
-        return blur
+        return np.sqrt(projector.blur_px**2 + of_projector**2 + 1 / 12 + camera_sigma**2)
 
     def light_on(self, z: float, is_lit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the projector's light (h, w) that returns from a white plane at depth z, and the room's, as shares of
@@ -236,7 +231,7 @@ class _Optics:
         points = _plane_points(self.rig, z)
         centre = -self.rig.R.T @ self.rig.t
         to_projector = centre - points
-        away = np.linalg.norm(to_projector, axis=2)
+        away = lengths(to_projector)
         even = (1 + (self.rig.camera.rays() ** 2).sum(axis=2)) ** -2
         lit = -to_projector[..., 2] / away * even * (z / away) ** 2
         brightest = np.quantile((lit + self.light.ambient * even)[is_lit], _BRIGHT_QUANTILE)

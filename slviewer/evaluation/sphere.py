@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slviewer.evaluation.fit import ShapeResult, measure
+from slviewer.evaluation.fit import ShapeResult, fit_shape
 from slviewer.evaluation.region import find_sphere, find_spheres, start_sphere
 from slviewer.geometry.shapes import Sphere, fit_sphere
 
@@ -38,7 +38,7 @@ def evaluate_sphere(
         start, mask = find_sphere(points, sigma_z=sigma_z, radius=radius)
     elif start is None:
         start = start_sphere(points, mask, sigma_z, radius)
-    sphere, result = measure(points, mask, sigma_z, start, fit_sphere)
+    sphere, result = fit_shape(points, mask, sigma_z, start, fit_sphere)
     return SphereResult(**vars(result), sphere=sphere)
 
 

@@ -75,18 +75,20 @@ def undistort_point(xd, yd, parameters):
     return np.nan, np.nan
 
 
+@kernel()
+def distort_to_px(x, y, parameters):
+    """Return the pixel (u, v) of an undistorted normalised point; NaN at and past the fold."""
+    if not x * x + y * y < parameters[9]:
+        return np.nan, np.nan
+    xd, yd, _, _, _ = distort_point(x, y, parameters)
+    return parameters[0] * xd + parameters[2], parameters[1] * yd + parameters[3]
+
+
 @kernel(parallel=True)
 def distort_all(normalised, parameters, pixels):
     """Fill ``pixels`` (n, 2) from undistorted normalised coordinates (n, 2); NaN at and past the fold."""
     for i in numba.prange(normalised.shape[0]):
-        x, y = normalised[i, 0], normalised[i, 1]
-        if x * x + y * y < parameters[9]:
-            xd, yd, _, _, _ = distort_point(x, y, parameters)
-            pixels[i, 0] = parameters[0] * xd + parameters[2]
-            pixels[i, 1] = parameters[1] * yd + parameters[3]
-        else:
-            pixels[i, 0] = np.nan
-            pixels[i, 1] = np.nan
+        pixels[i, 0], pixels[i, 1] = distort_to_px(normalised[i, 0], normalised[i, 1], parameters)
 
 
 @kernel(parallel=True)
@@ -107,8 +109,4 @@ def project_all(points, parameters, pixels):
         pixels[i, 0] = np.nan
         pixels[i, 1] = np.nan
         if z > 0.0:
-            x, y = points[i, 0] / z, points[i, 1] / z
-            if x * x + y * y < parameters[9]:
-                xd, yd, _, _, _ = distort_point(x, y, parameters)
-                pixels[i, 0] = parameters[0] * xd + parameters[2]
-                pixels[i, 1] = parameters[1] * yd + parameters[3]
+            pixels[i, 0], pixels[i, 1] = distort_to_px(points[i, 0] / z, points[i, 1] / z, parameters)

@@ -1,5 +1,6 @@
 """A camera or a projector as a pinhole with Brown distortion: from points to pixels and from pixels to rays."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -7,6 +8,7 @@ import numpy as np
 
 from slviewer.errors import InputError
 from slviewer.geometry.brown import distort_all, fold_radius_squared, project_all, undistort_all
+from slviewer.geometry.jit import read_only
 
 FOCAL_PX = 1.0, 1e7
 """Focal lengths that a lens may have; the principal point is as near to the image as the longest."""
@@ -43,15 +45,13 @@ class Lens:
                 f"A camera matrix must read [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], this one is {K.tolist()}: "
                 "check the key and calibrate without skew."
             )
-        if D.size > 5 and not D[5:].any():
-            D = D[:5]
-        if D.size not in (0, 4, 5) or not np.isfinite(D).all():
+        if D.size in (1, 2, 3) or D[5:].any() or not np.isfinite(D).all():
             raise InputError(
                 f"{D.size} distortion coefficients were given, {D.tolist()}, and this lens has five "
                 "(k1, k2, p1, p2, k3): calibrate without the rational, thin-prism and tilted models."
             )
-        D = np.concatenate([D, np.zeros(5 - D.size)])
-        width, height = (int(n) for n in self.size)
+        D = np.concatenate([D, np.zeros(5)])[:5]
+        width, height = map(int, self.size)
         if not (1 <= width <= LARGEST_PX and 1 <= height <= LARGEST_PX):
             raise InputError(
                 f"An image of {width}x{height} px was given: its size is width x height, 1 to {LARGEST_PX} px each."
@@ -66,11 +66,13 @@ class Lens:
             raise InputError(
                 f"The distortion coefficients {D.tolist()} belong to no lens: check them, or calibrate again."
             )
-        K.setflags(write=False)
-        D.setflags(write=False)
-        object.__setattr__(self, "K", K)
-        object.__setattr__(self, "D", D)
-        object.__setattr__(self, "size", (width, height))
+        vars(self).update(K=read_only(K), D=read_only(D), size=(width, height))
+
+    @classmethod
+    def from_parameters(cls, parameters: Iterable[float], size: tuple[int, int]) -> "Lens":
+        """Return the lens of fx, fy, cx, cy in px, and distortion coefficients in OpenCV's order, if any."""
+        fx, fy, cx, cy, *D = parameters
+        return cls(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]), np.array(D), size)
 
     @cached_property
     def parameters(self) -> np.ndarray:
@@ -105,6 +107,12 @@ class Lens:
         undistort_all(flat, self.parameters, normalised)
         return normalised.reshape(np.shape(pixels))
 
+    def contains(self, pixels: np.ndarray, margin_px: float = 0.0) -> np.ndarray:
+        """(...,) bool: pixels (..., 2) inside the image less a margin; False for NaN."""
+        with np.errstate(invalid="ignore"):
+            inside = (pixels > margin_px - 0.5) & (pixels < np.array(self.size) - 0.5 - margin_px)
+        return np.asarray(inside.all(axis=-1))
+
     def rays(self) -> np.ndarray:
         """(h, w, 2) float64: undistorted normalised coordinates of every pixel; computed once, read-only."""
         return self._rays
@@ -114,9 +122,7 @@ class Lens:
         """(h, w, 2) float64: undistorted normalised coordinates of every pixel, read-only."""
         width, height = self.size
         v, u = np.mgrid[:height, :width]
-        rays = self.undistort(np.stack([u, v], axis=-1))
-        rays.setflags(write=False)
-        return rays
+        return read_only(self.undistort(np.stack([u, v], axis=-1)))
 
     def resize(self, factor: float) -> "Lens":
         """Return the same lens at another resolution: pixel centres stay at whole numbers, so c' = (c + 0.5) factor -

@@ -8,6 +8,7 @@ from numpy.polynomial import chebyshev
 
 from slviewer.errors import InputError
 from slviewer.geometry.robust import fit_reweighted
+from slviewer.geometry.vectors import finite_rows
 
 Box = tuple[float, float, float, float]
 
@@ -34,7 +35,7 @@ class Polynomial2D:
         height, width = shape
         s, t = _normalise_pixels(origin[0] + np.arange(width), origin[1] + np.arange(height), self.box)
         degree = len(self.coefficients) - 1
-        out: np.ndarray = chebyshev.chebvander(t, degree) @ self.coefficients @ chebyshev.chebvander(s, degree).T
+        out = chebyshev.chebvander(t, degree) @ self.coefficients @ chebyshev.chebvander(s, degree).T
         out[np.abs(t) > 1.0], out[:, np.abs(s) > 1.0] = np.nan, np.nan
         return out
 
@@ -82,10 +83,25 @@ def monomials(points: np.ndarray, degree: int) -> np.ndarray:
     return np.stack([x[:, i] * y[:, j] for i in range(degree + 1) for j in range(degree + 1 - i)], axis=1)
 
 
+def fit_slopes(inputs: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return the slopes (k, m) of values (n, m) by ``inputs`` (n, k), by least squares with a constant.
+
+    Rows with NaN do not count.
+    """
+    known = finite_rows(inputs, values)
+    design = np.column_stack([inputs[known], np.ones(np.count_nonzero(known))])
+    return np.linalg.lstsq(design, values[known], rcond=None)[0][:-1]
+
+
+def grid_points(*coordinates: np.ndarray) -> np.ndarray:
+    """Return all combinations (n, k) of so many ``coordinates``, the first varying fastest in two dimensions."""
+    return np.stack(np.meshgrid(*coordinates), axis=-1).reshape(-1, len(coordinates))
+
+
 def scale_to_unit_square(points: np.ndarray) -> np.ndarray:
     """Scale points (n, 2) so that their extent along x and along y is -1 to 1."""
     low = points.min(0)
-    return np.asarray(2 * (points - low) / np.maximum(np.ptp(points, axis=0), 1e-9) - 1)
+    return 2 * (points - low) / np.maximum(np.ptp(points, axis=0), 1e-9) - 1
 
 
 def parse_box(extent: Sequence[float]) -> Box:

@@ -7,6 +7,7 @@ from scipy.spatial import cKDTree
 
 from slviewer.errors import InputError
 from slviewer.geometry.shapes import Plane, Sphere, fit_plane, fit_sphere
+from slviewer.geometry.vectors import diagonal, finite_rows, lengths, unit_vectors
 
 SAMPLE_SIZE = 3000
 """Points of the subsample that hypotheses are drawn from and scored on."""
@@ -15,49 +16,46 @@ REFINED_HYPOTHESES = 12
 """How many of the best hypotheses are refined by least squares before the best is chosen."""
 
 
-def ransac_plane(points: np.ndarray, tolerance: float, seed: int = 0) -> tuple[Plane, np.ndarray]:
+def ransac_plane(points: np.ndarray, tolerance: float) -> tuple[Plane, np.ndarray]:
     """The plane with most inliers among points (n, 3), to ``tolerance`` mm, and its inlier mask (n,) bool.
 
-    Draws from a subsample and ends with least squares over all inliers; deterministic for a given seed. NaN rows are
-    excluded. Raises InputError where no plane is detected.
+    Draws from a subsample and ends with least squares over all inliers; deterministic. NaN rows are excluded.
+    Raises InputError where no plane is detected.
     """
 
     def hypotheses(triples: np.ndarray) -> tuple[np.ndarray, ...]:
         """Return normals (k, 3) and offsets (k,) mm of the planes through point triples (k, 3, 3)."""
         a, b, c = triples[:, 0], triples[:, 1], triples[:, 2]
         normals = np.cross(b - a, c - a)
-        lengths = np.linalg.norm(normals, axis=1)
-        normals = normals[lengths > 0] / lengths[lengths > 0, None]
-        return normals, np.einsum("ij,ij->i", normals, a[lengths > 0])
+        regular = lengths(normals) > 0
+        normals = unit_vectors(normals[regular])
+        return normals, np.einsum("ij,ij->i", normals, a[regular])
 
     def distances(sample: np.ndarray, normal: np.ndarray, offset: np.ndarray) -> np.ndarray:
         """Return the signed distances (k, n) mm of the sample (n, 3) from each plane."""
-        result: np.ndarray = normal @ sample.T - offset[:, None]
-        return result
+        return normal @ sample.T - offset[:, None]
 
-    return _search(points, 3, tolerance, seed, hypotheses, distances, fit_plane, "plane")
+    return _search(points, 3, tolerance, hypotheses, distances, fit_plane, "plane")
 
 
-def ransac_sphere(
-    points: np.ndarray, tolerance: float, radius: float | None = None, seed: int = 0
-) -> tuple[Sphere, np.ndarray]:
+def ransac_sphere(points: np.ndarray, tolerance: float, radius: float | None = None) -> tuple[Sphere, np.ndarray]:
     """The sphere with most inliers among points (n, 3), to ``tolerance`` mm, and its inlier mask (n,) bool.
 
     With ``radius`` (mm), only spheres of about that size are considered and the result has exactly that radius;
     without, spheres larger than the cloud are excluded, because any flat patch would fit one.
     """
-    finite = np.asarray(points, dtype=np.float64)[np.isfinite(points).all(axis=-1)]
-    extent = float(np.linalg.norm(np.ptp(finite, axis=0))) if len(finite) else 0.0
+    finite = np.asarray(points, dtype=np.float64)[finite_rows(points)]
+    extent = diagonal(finite) if len(finite) else 0.0
     low, high = (10.0 * tolerance, 0.5 * extent) if radius is None else (0.7 * radius, 1.4 * radius)
 
     def hypotheses(quads: np.ndarray) -> tuple[np.ndarray, ...]:
         """Return centres (k, 3) and radii (k,) mm of the spheres through four points each (k, 4, 3)."""
         origin = quads[:, :1]
         edges = quads[:, 1:] - origin
-        regular = np.abs(np.linalg.det(edges)) > 1e-12 * np.linalg.norm(edges, axis=2).prod(axis=1)
+        regular = np.abs(np.linalg.det(edges)) > 1e-12 * lengths(edges).prod(axis=1)
         edges, origin = edges[regular], origin[regular, 0]
         offset = np.linalg.solve(2.0 * edges, (edges**2).sum(axis=2)[..., None])[..., 0]
-        radii = np.linalg.norm(offset, axis=1)
+        radii = lengths(offset)
         sized = (radii >= low) & (radii <= high)
         return (origin + offset)[sized], radii[sized]
 
@@ -66,8 +64,7 @@ def ransac_sphere(
         middle = sample.mean(axis=0)  # centred: the difference of squares loses no digits
         x, c = sample - middle, centre - middle
         squares = np.einsum("ij,ij->i", x, x) + np.einsum("ij,ij->i", c, c)[:, None] - 2.0 * c @ x.T
-        result: np.ndarray = np.sqrt(np.maximum(squares, 0.0)) - radii[:, None]
-        return result
+        return np.sqrt(np.maximum(squares, 0.0)) - radii[:, None]
 
     def fit(chosen: np.ndarray) -> Sphere:
         """Fit a sphere to the inliers (n, 3); InputError where its radius is outside the allowed range."""
@@ -76,14 +73,13 @@ def ransac_sphere(
             raise InputError(f"The detected sphere has a radius of {sphere.radius:.1f} mm, too large for its cloud.")
         return sphere
 
-    return _search(points, 4, tolerance, seed, hypotheses, distances, fit, "sphere")
+    return _search(points, 4, tolerance, hypotheses, distances, fit, "sphere")
 
 
 def _search(
     points: np.ndarray,
     needed: int,
     tolerance: float,
-    seed: int,
     hypotheses: Callable[[np.ndarray], tuple[np.ndarray, ...]],
     distances: Callable[..., np.ndarray],
     fit: Callable,
@@ -91,13 +87,13 @@ def _search(
 ) -> tuple:
     """Hypotheses from neighbours at many scales, scored by truncated squares (MSAC); the best few refined."""
     points = np.asarray(points, dtype=np.float64)
-    finite = np.isfinite(points).all(axis=-1)
+    finite = finite_rows(points)
     valid = points[finite]
     if len(valid) < 3 * needed:
         raise InputError(
             f"{len(valid)} points were measured, too few to detect a {what}: check the capture's exposure."
         )
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     sample = valid[rng.choice(len(valid), min(SAMPLE_SIZE, len(valid)), replace=False)]
     parameters = hypotheses(_minimal_sets(sample, needed, rng))
     # score in slices, so that the table of distances stays small
@@ -154,5 +150,4 @@ def _minimal_sets(sample: np.ndarray, size: int, rng: np.random.Generator) -> np
 
 def _score(residuals: np.ndarray, tolerance: float) -> np.ndarray:
     """Sum of squares truncated at the tolerance, along the last axis: fewer and larger residuals cost more."""
-    total: np.ndarray = np.minimum((residuals / tolerance) ** 2, 1.0).sum(axis=-1)
-    return total
+    return np.minimum((residuals / tolerance) ** 2, 1.0).sum(axis=-1)

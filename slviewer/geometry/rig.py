@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from slviewer.errors import InputError
+from slviewer.geometry.jit import read_only
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.rigid import rigid_transform
 
@@ -37,10 +38,7 @@ class StereoRig:
                 f"Camera and projector are {np.linalg.norm(t):.3g} mm apart: give the translation in mm, "
                 f"{LARGEST_BASELINE_MM:g} at most."
             )
-        R.setflags(write=False)
-        t.setflags(write=False)
-        object.__setattr__(self, "R", R)
-        object.__setattr__(self, "t", t)
+        vars(self).update(R=read_only(R), t=read_only(t))
 
     @property
     def T_projector_camera(self) -> np.ndarray:

@@ -27,18 +27,35 @@ def turn_about(rotation: Floats, centre: Floats, shift: Floats | float = 0.0) ->
 
 def move_points(T: Floats, points: np.ndarray) -> Floats:
     """(..., n, 3): points (n, 3) mm moved by each motion ``T`` (..., 4, 4); NaN stays NaN."""
-    return np.asarray(points @ np.swapaxes(T[..., :3, :3], -1, -2) + T[..., None, :3, 3])
+    return points @ np.swapaxes(T[..., :3, :3], -1, -2) + T[..., None, :3, 3]
+
+
+def motion_jacobian(arm: Floats) -> Floats:
+    """Return the derivatives (m, 3, 6) of points by a small rotation (rad) about a centre and a shift (mm).
+
+    ``arm`` (m, 3) mm: the points less the centre.
+    """
+    J = np.zeros((len(arm), 3, 6))
+    J[:, :, 3:] = np.eye(3)
+    for k, (a, b) in enumerate(((1, 2), (2, 0), (0, 1))):  # rotation x arm
+        J[:, a, k], J[:, b, k] = -arm[:, b], arm[:, a]
+    return J
 
 
 def nearest_rotation(M: Floats) -> Floats:
     """(3, 3): the rotation nearest to a matrix (3, 3) in the Frobenius norm."""
     U, _, Vt = np.linalg.svd(M)
-    return np.asarray(U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt)
+    return U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
 
 
 def rotation_angle(R: Floats) -> Floats:
     """(...,) rad: the angle of rotations (..., 3, 3), 0 to pi."""
-    return np.asarray(Rotation.from_matrix(R).magnitude())
+    return Rotation.from_matrix(R).magnitude()
+
+
+def largest_angle_deg(directions: Floats) -> float:
+    """Return the largest angle in degrees between two of the unit vectors (n, 3)."""
+    return float(np.degrees(np.arccos(np.clip(directions @ directions.T, -1, 1).min())))
 
 
 def fit_rigid(points: Floats, targets: Floats) -> Floats:

@@ -18,8 +18,7 @@ def robust_sigma(residuals: np.ndarray, about: float | None = None) -> float:
 def tukey_weights(residuals: np.ndarray, sigma: float) -> np.ndarray:
     """Tukey's biweight at 4.685 sigma (95 % efficient on normal residuals): 0 beyond."""
     scaled = np.minimum(np.abs(residuals) / (4.685 * sigma), 1.0)
-    weights: np.ndarray = (1.0 - scaled**2) ** 2
-    return weights
+    return (1.0 - scaled**2) ** 2
 
 
 def fit_reweighted(

@@ -6,6 +6,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from slviewer.errors import InputError
+from slviewer.geometry.vectors import finite_rows
 
 MIN_CAP_HEIGHT_RATIO = 4.0
 """A patch is fitted by a sphere only if its height over a plane is at least this many times the fit's RMS residual."""
@@ -20,8 +21,7 @@ class Plane:
 
     def distance(self, points: np.ndarray) -> np.ndarray:
         """Signed distances (...) mm of points (..., 3), positive on the camera's side."""
-        distances: np.ndarray = np.asarray(points, dtype=np.float64) @ self.normal - self.offset
-        return distances
+        return np.asarray(points, dtype=np.float64) @ self.normal - self.offset
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +87,7 @@ def _select_finite(points: np.ndarray, least: int, what: str) -> tuple[np.ndarra
     points = np.asarray(points, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3:
         raise InputError(f"Points of shape {points.shape} were given for {what}: they must be (n, 3).")
-    finite = np.isfinite(points).all(axis=1)
+    finite = finite_rows(points)
     if finite.sum() < least:
         raise InputError(
             f"{finite.sum()} points were measured, and {what} needs {least} at least: select a wider region."
@@ -97,8 +97,7 @@ def _select_finite(points: np.ndarray, least: int, what: str) -> tuple[np.ndarra
 
 def _norms(vectors: np.ndarray) -> np.ndarray:
     """Lengths (...) of vectors (..., 3): `numpy.linalg.norm` along a short axis takes several times as long."""
-    lengths: np.ndarray = np.sqrt(np.einsum("...i,...i->...", vectors, vectors))
-    return lengths
+    return np.sqrt(np.einsum("...i,...i->...", vectors, vectors))
 
 
 def _algebraic_sphere(points: np.ndarray) -> tuple[np.ndarray, float]:

@@ -40,8 +40,8 @@ class SplineSurface:
         inside = np.isfinite(values)
         ny, nx = (n - 3 for n in self.coefficients.shape)
         u0, v0, u1, v1 = self.trend.box
-        cells_u, basis_u = _basis(u.ravel()[inside], u0, u1, nx)
-        cells_v, basis_v = _basis(v.ravel()[inside], v0, v1, ny)
+        cells_u, basis_u = cubic_basis(u.ravel()[inside], u0, u1, nx)
+        cells_v, basis_v = cubic_basis(v.ravel()[inside], v0, v1, ny)
         values[inside] += _spline_at(cells_u, basis_u, cells_v, basis_v, self.coefficients)
         return values.reshape(u.shape)
 
@@ -82,19 +82,23 @@ def fit_spline(
     u, v, values, weights = select_valid_samples(u, v, values, weights, box)
     trend = fit_polynomial(u, v, values, weights, box, TREND_DEGREE, robust)
     rest = values - trend.evaluate(u, v)
-    cells_u, basis_u = _basis(u, box[0], box[2], nx)
-    cells_v, basis_v = _basis(v, box[1], box[3], ny)
+    cells_u, basis_u = cubic_basis(u, box[0], box[2], nx)
+    cells_v, basis_v = cubic_basis(v, box[1], box[3], ny)
     reached = len(np.unique(cells_v * nx + cells_u))
-    shape = nx + 3, ny + 3
-    prior = (weights.sum() / reached) * (smooth * _second_differences(*shape) + RIDGE * _identity(*shape))
+    columns, count = nx + 3, (nx + 3) * (ny + 3)
+    penalty = sp.tril(bending_energy(columns, ny + 3), format="coo")
+    prior = np.zeros((3 * columns + 4, count))  # in lower banded form
+    prior[penalty.row - penalty.col, penalty.col] = smooth * penalty.data
+    prior[0] += RIDGE
+    prior *= weights.sum() / reached
 
     def solve(w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the coefficients (ny + 3, nx + 3) and fitted values (n,) for sample weights (n,)."""
         band = prior.copy()
-        right = np.zeros((ny + 3) * (nx + 3))
-        _accumulate(cells_u, basis_u, cells_v, basis_v, w, rest, nx + 3, band, right)
+        right = np.zeros(count)
+        _accumulate(cells_u, basis_u, cells_v, basis_v, w, rest, columns, band, right)
         solution = solveh_banded(band, right, lower=True, overwrite_ab=True, overwrite_b=True, check_finite=False)
-        coefficients = solution.reshape(ny + 3, nx + 3)
+        coefficients = solution.reshape(-1, columns)
         return coefficients, _spline_at(cells_u, basis_u, cells_v, basis_v, coefficients)
 
     return SplineSurface(trend, fit_reweighted(solve, rest, weights) if robust else solve(weights)[0])
@@ -102,14 +106,14 @@ def fit_spline(
 
 def _basis_matrix(positions: np.ndarray, start: float, end: float, cells: int) -> np.ndarray:
     """(n, cells + 3): weight of each coefficient at each position."""
-    cell, weights = _basis(positions, start, end, cells)
+    cell, weights = cubic_basis(positions, start, end, cells)
     matrix = np.zeros((len(positions), cells + 3))
     np.put_along_axis(matrix, cell[:, None] + np.arange(4), weights, axis=1)
     return matrix
 
 
-def _basis(positions: np.ndarray, start: float, end: float, cells: int) -> tuple[np.ndarray, np.ndarray]:
-    """Each position's cell (n,), clipped to the box, and its four cubic B-spline weights (n, 4)."""
+def cubic_basis(positions: np.ndarray, start: float, end: float, cells: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return each position's cell (n,), one of those from start to end, and its four cubic B-spline weights (n, 4)."""
     x = (positions - start) * (cells / (end - start))
     cell = np.clip(np.floor(x).astype(np.int64), 0, cells - 1)
     f = x - cell
@@ -118,30 +122,21 @@ def _basis(positions: np.ndarray, start: float, end: float, cells: int) -> tuple
     return cell, weights
 
 
-def _bandwidth(columns: int) -> int:
-    """Return the number of subdiagonals of the normal equations with so many columns of coefficients."""
-    return 3 * columns + 3
+def second_differences(count: int) -> sp.dia_array:
+    """Return the second differences (count - 2, count) of so many coefficients."""
+    return sp.diags([1.0, -2.0, 1.0], [0, 1, 2], shape=(count - 2, count))
 
 
-def _identity(columns: int, rows: int) -> np.ndarray:
-    """The identity in lower banded form."""
-    band = np.zeros((_bandwidth(columns) + 1, columns * rows))
-    band[0] = 1.0
-    return band
+def bending_energy(columns: int, rows: int) -> sp.sparray:
+    """Return the quadratic form d_uu^2 + 2 d_uv^2 + d_vv^2 of coefficients (rows, columns), as of a thin plate.
 
-
-def _second_differences(columns: int, rows: int) -> np.ndarray:
-    """Thin-plate penalty d_uu^2 + 2 d_uv^2 + d_vv^2 of the coefficients, in lower banded form."""
+    It is a sparse matrix (rows columns, rows columns) of first and second differences.
+    """
     first = [sp.diags([-1.0, 1.0], [0, 1], shape=(n - 1, n)) for n in (columns, rows)]
-    second = [sp.diags([1.0, -2.0, 1.0], [0, 1, 2], shape=(n - 2, n)) for n in (columns, rows)]
-    uu = sp.kron(sp.eye(rows), second[0])
-    vv = sp.kron(second[1], sp.eye(columns))
+    uu = sp.kron(sp.eye(rows), second_differences(columns))
+    vv = sp.kron(second_differences(rows), sp.eye(columns))
     uv = sp.kron(first[1], first[0])
-    penalty = (uu.T @ uu + 2.0 * uv.T @ uv + vv.T @ vv).tocoo()
-    lower = penalty.row >= penalty.col
-    band = np.zeros((_bandwidth(columns) + 1, columns * rows))
-    band[(penalty.row - penalty.col)[lower], penalty.col[lower]] = penalty.data[lower]
-    return band
+    return uu.T @ uu + 2.0 * uv.T @ uv + vv.T @ vv
 
 
 @kernel()

@@ -1,6 +1,7 @@
 """Depth from one projector coordinate per camera pixel, exact under both lenses' distortion."""
 
 import math
+from collections.abc import Iterable
 from typing import Literal
 
 import numba
@@ -8,7 +9,7 @@ import numpy as np
 
 from slviewer.errors import InputError
 from slviewer.geometry.brown import distort_point
-from slviewer.geometry.jit import kernel
+from slviewer.geometry.jit import kernel, read_only
 from slviewer.geometry.rig import StereoRig
 
 TOLERANCE_PX = 1e-7
@@ -31,7 +32,7 @@ def triangulate(
     behind a device, more than a tenth outside the projector's image or past the fold of a lens, the steps do not
     converge, or z lies outside ``z_range`` (mm). Raises InputError where the map has not the camera's image size.
     """
-    _check_map(rig, coordinate, "projector coordinates")
+    check_map(rig.camera.size, coordinate, "projector coordinates")
     z = _solve(rig, rig.camera.rays().reshape(-1, 2), np.asarray(coordinate).reshape(-1), axis)
     if z_range is not None:
         z[~((z >= z_range[0]) & (z <= z_range[1]))] = np.nan
@@ -61,7 +62,7 @@ def depth_per_px(rig: StereoRig, axis: Literal["x", "y"], z: np.ndarray) -> np.n
 
     What a projector coordinate's uncertainty becomes in depth; NaN where z is, or where the point cannot be projected.
     """
-    _check_map(rig, z, "depths")
+    check_map(rig.camera.size, z, "depths")
     slopes = np.empty(np.size(z))
     rays, depths = _as_read_only(rig.camera.rays().reshape(-1, 2)), _as_read_only(np.asarray(z).reshape(-1))
     _coordinate_slopes(rays, depths, rig.R.copy(), rig.t.copy(), rig.projector.parameters, _axis_row(axis), slopes)
@@ -104,9 +105,9 @@ def _axis_row(axis: str) -> int:
     return 0 if axis == "x" else 1
 
 
-def _check_map(rig: StereoRig, values: np.ndarray, what: str) -> None:
-    """Raise InputError unless a map has the size (h, w) of the rig's camera."""
-    width, height = rig.camera.size
+def check_map(size: Iterable[float], values: np.ndarray, what: str) -> None:
+    """Raise InputError unless a map has the size (width, height) of the camera's image."""
+    width, height = map(int, size)
     if np.shape(values) != (height, width):
         raise InputError(
             f"A map of {what} of shape {np.shape(values)} was given, and the camera was calibrated at {width}x{height} "
@@ -116,9 +117,17 @@ def _check_map(rig: StereoRig, values: np.ndarray, what: str) -> None:
 
 def _as_read_only(values: np.ndarray) -> np.ndarray:
     """Convert to read-only contiguous float64: one array type for the kernels, so that they compile once."""
-    view = np.ascontiguousarray(values, dtype=np.float64).view()
-    view.setflags(write=False)
-    return view
+    return read_only(np.ascontiguousarray(values, dtype=np.float64))
+
+
+@kernel()
+def _rotate_ray(R, uc, vc):
+    """Return the ray (uc, vc, 1) rotated by R."""
+    return (
+        R[0, 0] * uc + R[0, 1] * vc + R[0, 2],
+        R[1, 0] * uc + R[1, 1] * vc + R[1, 2],
+        R[2, 0] * uc + R[2, 1] * vc + R[2, 2],
+    )
 
 
 @kernel()
@@ -150,9 +159,7 @@ def ray_depth(uc, vc, measured, shift, R, t, parameters, row, extent):
 
     ``shift``: initial value of the second.
     """
-    a0 = R[0, 0] * uc + R[0, 1] * vc + R[0, 2]
-    a1 = R[1, 0] * uc + R[1, 1] * vc + R[1, 2]
-    a2 = R[2, 0] * uc + R[2, 1] * vc + R[2, 2]
+    a0, a1, a2 = _rotate_ray(R, uc, vc)
     a = a0 if row == 0 else a1
     reading = (measured - parameters[2 + row]) / parameters[row]
     up = reading + shift
@@ -206,8 +213,5 @@ def _triangulate_all(rays, coordinate, R, t, parameters, row, extent, z):
 def _coordinate_slopes(rays, depths, R, t, parameters, row, slopes):
     """Fill ``slopes`` (n,) with d(projector coordinate)/dz in px per mm of rays (n, 2) at depths (n,) mm."""
     for i in numba.prange(depths.shape[0]):
-        uc, vc = rays[i, 0], rays[i, 1]
-        a0 = R[0, 0] * uc + R[0, 1] * vc + R[0, 2]
-        a1 = R[1, 0] * uc + R[1, 1] * vc + R[1, 2]
-        a2 = R[2, 0] * uc + R[2, 1] * vc + R[2, 2]
+        a0, a1, a2 = _rotate_ray(R, rays[i, 0], rays[i, 1])
         _, _, slopes[i], _, _ = _projection(depths[i], a0, a1, a2, t, parameters, row)

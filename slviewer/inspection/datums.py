@@ -7,6 +7,7 @@ import numpy as np
 
 from slviewer.errors import InputError
 from slviewer.geometry.rigid import move_points, rigid_transform
+from slviewer.geometry.vectors import unit_vectors
 from slviewer.inspection.features import Feature
 from slviewer.inspection.fitting import FeatureFit
 from slviewer.inspection.uncertainty import RigidSpread, Spread
@@ -23,12 +24,11 @@ def datum_frame(features: Sequence[Feature]) -> np.ndarray:
     the tertiary's. Raises InputError for others, or where they do not fix a frame.
     """
     primary, secondary, tertiary = features
-    if primary.kind != "plane" or primary.direction is None:
+    if primary.kind != "plane":
         raise InputError(f"The primary datum is a {primary.kind}: choose a plane.")
-    z = primary.direction
+    z = primary.unit_direction
     if secondary.kind == "plane":
-        assert secondary.direction is not None
-        towards = secondary.direction
+        towards = secondary.unit_direction
     elif tertiary.kind != "plane":
         towards = tertiary.place - secondary.place
     else:
@@ -36,11 +36,11 @@ def datum_frame(features: Sequence[Feature]) -> np.ndarray:
     across = towards - (towards @ z) * z
     if not np.linalg.norm(across) > MIN_SINE * np.linalg.norm(towards):
         raise InputError("The secondary datum fixes no direction in the primary: choose another.")
-    x = across / np.linalg.norm(across)
+    x = unit_vectors(across)
     y = np.cross(z, x)
     # rows n and values n . p of the planes through the origin of the part
     if secondary.kind == "plane":
-        rows = [z, towards, tertiary.direction if tertiary.kind == "plane" and tertiary.direction is not None else y]
+        rows = [z, towards, tertiary.unit_direction if tertiary.kind == "plane" else y]
         places = [primary.place, secondary.place, tertiary.place]
     else:
         rows, places = [z, x, y], [primary.place, secondary.place, secondary.place]
@@ -75,10 +75,10 @@ def datum_spread(fits: Sequence[FeatureFit], middle: np.ndarray) -> RigidSpread:
 def face_towards(fit: FeatureFit, side: np.ndarray) -> FeatureFit:
     """The fit with a plane's normal turned to the half-space of a direction ``side`` (3,); others unchanged."""
     f = fit.feature
-    if f.kind != "plane" or f.direction is None or f.direction @ side >= 0:
+    if f.kind != "plane" or f.unit_direction @ side >= 0:
         return fit
     sign = np.array([1.0, -1.0, -1.0])  # the second tangent stays, the first and the normal are reversed
     spread = fit.spread
     shared = None if spread.shared is None else spread.shared * sign
     turned = Spread(spread.scatter * np.outer(sign, sign), shared, spread.calibration)
-    return replace(fit, feature=replace(f, direction=-f.direction), spread=turned)
+    return replace(fit, feature=replace(f, direction=-f.unit_direction), spread=turned)

@@ -9,6 +9,7 @@ from scipy.spatial import cKDTree
 
 from slviewer.errors import InputError
 from slviewer.geometry.rigid import move_points, turn_about
+from slviewer.geometry.vectors import rms
 from slviewer.inspection.nominal_surface import NominalSurface
 from slviewer.inspection.placing import search_start
 from slviewer.inspection.uncertainty import RigidSpread, scatter_covariance
@@ -63,7 +64,7 @@ class Deviation:
         low, high = np.percentile(values, [0.15, 99.85])
         return {
             "mean": float(values.mean()),
-            "rms": float(np.sqrt(np.mean(values**2))),
+            "rms": rms(values),
             "sigma": float(values.std()),
             "within_95": float(np.percentile(np.abs(values), 95)),
             "lowest": float(values.min()),

@@ -6,6 +6,7 @@ from typing import Literal
 import numpy as np
 
 from slviewer.errors import InputError
+from slviewer.geometry.vectors import lengths, unit_vectors
 
 Kind = Literal["point", "plane", "sphere", "cylinder"]
 KINDS: tuple[Kind, ...] = ("point", "plane", "sphere", "cylinder")
@@ -32,16 +33,15 @@ class Feature:
         outwards."""
         offsets = np.asarray(points, np.float64) - self.place
         if self.kind == "plane":
-            return np.asarray(offsets @ self._direction)
-        return np.linalg.norm(self._across(offsets), axis=-1) - (self.radius or 0.0)
+            return offsets @ self.unit_direction
+        return lengths(self._across(offsets)) - (self.radius or 0.0)
 
     def normals(self, points: np.ndarray) -> np.ndarray:
         """Return the unit vectors (n, 3) along which ``distance`` grows."""
         offsets = np.asarray(points, np.float64) - self.place
         if self.kind == "plane":
-            return np.broadcast_to(self._direction, offsets.shape)
-        across = self._across(offsets)
-        return np.asarray(across / np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-300))
+            return np.broadcast_to(self.unit_direction, offsets.shape)
+        return unit_vectors(self._across(offsets))
 
     def jacobian(self, points: np.ndarray) -> np.ndarray:
         """Return the derivatives (n, p) of ``distance`` of the points (n, 3) by the parameters."""
@@ -55,7 +55,7 @@ class Feature:
         if self.kind == "plane":
             return np.hstack([offsets @ e.T, minus])
         shifts = -normals @ e.T
-        return np.hstack([(offsets @ self._direction)[:, None] * shifts, shifts, minus])
+        return np.hstack([(offsets @ self.unit_direction)[:, None] * shifts, shifts, minus])
 
     def moved(self, step: np.ndarray) -> "Feature":
         """Return the feature with its parameters changed by a step (p,)."""
@@ -64,10 +64,9 @@ class Feature:
             radius = None if self.radius is None else self.radius + step[3]
             return replace(self, place=self.place + step[:3], radius=radius)
         e = self._tangents()
-        tilted = self._direction + step[:2] @ e
-        tilted /= np.linalg.norm(tilted)
+        tilted = unit_vectors(self.unit_direction + step[:2] @ e)
         if self.kind == "plane":
-            return replace(self, place=self.place + step[2] * self._direction, direction=tilted)
+            return replace(self, place=self.place + step[2] * self.unit_direction, direction=tilted)
         assert self.radius is not None
         return replace(self, place=self.place + step[2:4] @ e, direction=tilted, radius=self.radius + step[4])
 
@@ -77,24 +76,23 @@ class Feature:
         return {"point": 3, "plane": 3, "sphere": 4, "cylinder": 5}[self.kind]
 
     @property
-    def _direction(self) -> np.ndarray:
+    def unit_direction(self) -> np.ndarray:
         """Unit normal or axis (3,); InputError for a feature without one."""
         if self.direction is None:
-            raise InputError(f"A {self.kind} has no direction: fit a plane or a cylinder.")
+            raise InputError(f"A {self.kind} has no direction: choose a plane or a cylinder.")
         return self.direction
 
     def _across(self, offsets: np.ndarray) -> np.ndarray:
         """Return the offsets (n, 3) from the feature's place, for a cylinder only their part across the axis."""
         if self.kind != "cylinder":
             return offsets
-        return np.asarray(offsets - (offsets @ self._direction)[..., None] * self._direction)
+        return offsets - (offsets @ self.unit_direction)[..., None] * self.unit_direction
 
     def _tangents(self) -> np.ndarray:
         """Return two unit vectors (2, 3) perpendicular to the direction and to each other."""
-        least = np.eye(3)[np.argmin(np.abs(self._direction))]
-        first = _cross(self._direction, least)
-        first /= np.linalg.norm(first)
-        return np.stack([first, _cross(self._direction, first)])
+        least = np.eye(3)[np.argmin(np.abs(self.unit_direction))]
+        first = unit_vectors(_cross(self.unit_direction, least))
+        return np.stack([first, _cross(self.unit_direction, first)])
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:

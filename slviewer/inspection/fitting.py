@@ -10,6 +10,7 @@ from slviewer.errors import InputError
 from slviewer.evaluation.acceptance.figures import narrowest_range
 from slviewer.evaluation.fit import SET_ASIDE_SIGMA, SET_ASIDE_WARNING, fit_settled, within_sigmas
 from slviewer.geometry.robust import fit_reweighted, robust_sigma
+from slviewer.geometry.vectors import diagonal, finite_rows, rms
 from slviewer.inspection.features import Feature, Kind
 from slviewer.inspection.quantities import Quantity
 from slviewer.inspection.starts import estimate_start, fit_plane_feature, fit_sphere_feature
@@ -87,7 +88,7 @@ def fit_feature(kind: Kind, points: np.ndarray, shared: Shared | None = None, ca
     InputError where the region does not hold the shape.
     """
     points = np.asarray(points, np.float64)
-    points = points[np.isfinite(points).all(axis=1)]
+    points = points[finite_rows(points)]
     if len(points) < LEAST_POINTS:
         raise InputError(
             f"The region holds {len(points)} measured points: a {kind} needs {LEAST_POINTS}; select a wider region."
@@ -103,7 +104,6 @@ def fit_feature(kind: Kind, points: np.ndarray, shared: Shared | None = None, ca
     counted = within_sigmas(residuals, points)
     used = int(np.count_nonzero(counted))
     excluded_share = 1 - used / len(points)
-    rms = float(np.sqrt(np.mean(residuals[counted] ** 2)))
     if excluded_share > MAX_EXCLUDED_SHARE:
         raise InputError(
             f"{100 * excluded_share:.0f} % of the region lies off the best {kind}: "
@@ -119,9 +119,9 @@ def fit_feature(kind: Kind, points: np.ndarray, shared: Shared | None = None, ca
             f"{100 * excluded_share:.1f} % of the region lie beyond {SET_ASIDE_SIGMA:g} robust sigma "
             f"of the {kind} and were excluded: see that it shows nothing else"
         )
-    farthest = float(residuals[counted][np.argmax(np.abs(residuals[counted]))])
-    form = narrowest_range(residuals[counted], 0.95)
-    return FeatureFit(feature, spread, rms, farthest, form, used, len(points) - used, tuple(warnings))
+    fitted = residuals[counted]
+    farthest, form = float(fitted[np.argmax(np.abs(fitted))]), narrowest_range(fitted, 0.95)
+    return FeatureFit(feature, spread, rms(fitted), farthest, form, used, len(points) - used, tuple(warnings))
 
 
 def least_squares(kind: Kind, points: np.ndarray, start: Feature | None) -> Feature:
@@ -151,10 +151,10 @@ def _fit_cylinder(start: Feature, points: np.ndarray) -> Feature:
         lambda step: start.moved(step).distance(points), np.zeros(start.parameters), method="lm", max_nfev=600
     )
     feature = start.moved(solution.x)
-    if not 0 < (feature.radius or 0.0) < MAX_RADIUS_RATIO * float(np.linalg.norm(np.ptp(points, axis=0))):
+    if not 0 < (feature.radius or 0.0) < MAX_RADIUS_RATIO * diagonal(points):
         raise InputError("No cylinder fits: its radius diverges; select a region that shows more of its curve.")
-    assert feature.direction is not None
-    along = feature.direction * np.sign(feature.direction[np.argmax(np.abs(feature.direction))])
+    axis = feature.unit_direction
+    along = axis * np.sign(axis[np.argmax(np.abs(axis))])
     middle = feature.place + ((points.mean(axis=0) - feature.place) @ along) * along
     return Feature("cylinder", middle, along, feature.radius)
 
@@ -177,7 +177,7 @@ def _refuse_other(kind: Kind, feature: Feature, points: np.ndarray) -> None:
     some = points[:: -(-len(points) // MAX_COMPARED_POINTS)]
     mine = robust_sigma(feature.distance(some))
     if kind == "plane":
-        size = float(np.linalg.norm(np.ptp(some, axis=0)))
+        size = diagonal(some)
         if mine > MAX_RMS_RISE * size and mine > RIVAL_RATIO * _residual_from_quadric(feature, some):
             raise InputError(
                 f"The region bends: it rises {mine:.3g} mm off its best plane over {size:.3g} mm; fit a sphere or a "
@@ -224,9 +224,9 @@ def _residual_of(kind: Kind, points: np.ndarray) -> float:
 
 def _residual_from_quadric(plane: Feature, points: np.ndarray) -> float:
     """Return the robust sigma in mm about the quadratic surface over a plane: curvature removed, noise remains."""
-    assert plane.direction is not None
+    normal = plane.unit_direction
     offsets = points - points.mean(axis=0)
-    _, _, axes = np.linalg.svd(offsets - (offsets @ plane.direction)[:, None] * plane.direction, full_matrices=False)
+    _, _, axes = np.linalg.svd(offsets - (offsets @ normal)[:, None] * normal, full_matrices=False)
     u, v = offsets @ axes[0], offsets @ axes[1]
     basis = np.column_stack([np.ones_like(u), u, v, u * u, u * v, v * v])
     heights = plane.distance(points)

@@ -12,7 +12,7 @@ Reference features are those of least squares (GG), whose zones are never narrow
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import product
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 from scipy.ndimage import uniform_filter
@@ -22,6 +22,7 @@ from scipy.stats import chi2
 from slviewer.errors import InputError
 from slviewer.geometry.cubes import occupied_cubes
 from slviewer.geometry.robust import robust_sigma
+from slviewer.geometry.vectors import finite_rows, unit_vectors
 from slviewer.inspection.features import Feature
 from slviewer.inspection.fitting import MAX_FITTED_POINTS, MAX_SHARED_POINTS, FeatureFit
 from slviewer.inspection.quantities import Quantity
@@ -29,8 +30,6 @@ from slviewer.inspection.uncertainty import DRAWS, PATCHES, RigidSpread, Shared,
 
 FormKind = Literal["flatness", "roundness", "cylindricity"]
 OrientationKind = Literal["parallelism", "perpendicularity"]
-FORM_KINDS: tuple[FormKind, ...] = get_args(FormKind)
-ORIENTATION_KINDS: tuple[OrientationKind, ...] = get_args(OrientationKind)
 DEGREE = 6
 """Of the polynomials across a region that count as form; what is finer is noise or unresolved."""
 MAX_DRAWN_POINTS = 5_000
@@ -77,7 +76,7 @@ class SmoothDeviations:
     @property
     def smooth(self) -> np.ndarray:
         """(n,) mm: the smooth part, the mean of its draws."""
-        return np.asarray(self.basis @ self.draws.mean(axis=1))
+        return self.basis @ self.draws.mean(axis=1)
 
 
 def smooth_deviations(
@@ -106,8 +105,7 @@ def smooth_deviations(
                 f"The region holds {n} measured points: its form needs {POINTS_PER_TERM * (r + removed.shape[1])}; "
                 "select a wider region."
             )
-        whole = np.hstack([removed, basis])
-        residuals = d[counted] - whole @ (whole.T @ d[counted])
+        whole, residuals = _project_out(d[counted], removed, basis)
         reach = max(SPIKE_SIGMA * robust_sigma(residuals), 1e-9 * float(np.abs(points).max()))
         within = np.abs(residuals) <= reach
         if within.all():
@@ -116,8 +114,7 @@ def smooth_deviations(
     d, points, normals, coordinates = d[counted], points[counted], normals[counted], coordinates[counted]
     if len(d) < n:
         removed, basis, degrees = _smooth_basis(coordinates, fitted[counted])
-        whole = np.hstack([removed, basis])
-        residuals = d - whole @ (whole.T @ d)
+        whole, residuals = _project_out(d, removed, basis)
     n, columns = whole.shape
     noise = float(np.sqrt(residuals @ residuals / (n - columns)))
     factor, unresolved = _patch_misfit(residuals, coordinates, noise, n, columns)
@@ -181,12 +178,12 @@ def form_error(kind: FormKind, fit: FeatureFit, points: np.ndarray, shared: Shar
     wanted = {"flatness": ("plane",), "cylindricity": ("cylinder",), "roundness": ("sphere", "cylinder")}[kind]
     if f.kind not in wanted:
         raise InputError(f"A {f.kind} has no {kind}: choose a {' or a '.join(wanted)}.")
-    points = points[np.isfinite(points).all(axis=1)]
+    points = points[finite_rows(points)]
     if kind == "roundness":
         points, axis = _section_points(f, points)
         normals = f.normals(points)
         across = normals - (normals @ axis)[:, None] * axis
-        coordinates = across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-12)
+        coordinates = unit_vectors(across)
         fitted = np.column_stack([coordinates, np.ones(len(points))])  # a circle: a thin section shows no tilt
         first = coordinates[0]
         unrolled = np.arctan2(coordinates @ np.cross(axis, first), coordinates @ first)[:, None]
@@ -214,39 +211,35 @@ def orientation_error(
     than `MAX_TILT_DEG` from the requested orientation.
     """
     f, d = fit.feature, datum.feature
-    for each in (f, d):
-        if each.direction is None:
-            raise InputError(f"A {each.kind} has no direction: {kind} needs planes or cylinders.")
-    assert f.direction is not None and d.direction is not None
     # directions of a plane's normal and of an axis answer to each other as perpendicular and parallel
     along = (kind == "parallelism") == (f.kind == d.kind)
-    cosine = abs(float(f.direction @ d.direction))
+    cosine = abs(float(f.unit_direction @ d.unit_direction))
     tilt = float(np.degrees(np.arccos(min(cosine, 1.0)) if along else np.arcsin(min(cosine, 1.0))))
     if tilt > MAX_TILT_DEG:
         raise InputError(f"The {f.kind} is {tilt:.1f} degrees from the {kind} to the {d.kind}: choose another datum.")
-    points = points[np.isfinite(points).all(axis=1)]
+    points = points[finite_rows(points)]
     if f.kind == "cylinder":
         return _axis_orientation(kind, fit, points, datum, along)
 
     def zone_normal(datum_direction: np.ndarray) -> np.ndarray:
         """The unit normal (3,) of the zone's planes, for a direction of the datum."""
-        assert f.direction is not None
+        direction = f.unit_direction
         if along:
-            return datum_direction * np.sign(datum_direction @ f.direction)
-        across = f.direction - (f.direction @ datum_direction) * datum_direction
-        return np.asarray(across / np.linalg.norm(across))
+            return datum_direction * np.sign(datum_direction @ direction)
+        across = direction - (direction @ datum_direction) * datum_direction
+        return unit_vectors(across)
 
-    normal = zone_normal(d.direction)
+    normal = zone_normal(d.unit_direction)
     normals = np.broadcast_to(normal, points.shape)
     smooth = smooth_deviations(
         (points - f.place) @ normal, points, normals, _region_coordinates(points), np.ones((len(points), 1))
     )
     steps = draw_steps(datum.spread.covariance, np.random.default_rng(1))
-    turned = np.stack([zone_normal(_direction_of(d.moved(step))) for step in steps]) - normal
+    turned = np.stack([zone_normal(d.moved(step).unit_direction) for step in steps]) - normal
 
     def displaced(places: np.ndarray) -> np.ndarray:
         """Changes of the heights (n, draws) by the draws of the datum."""
-        return np.asarray((places - f.place) @ turned.T)
+        return (places - f.place) @ turned.T
 
     return zone_width(kind, smooth, lambda heights: np.ptp(heights, axis=0), shared, displaced)
 
@@ -261,7 +254,7 @@ def position_error(
     """
     if fit.feature.kind != nominal.kind:
         raise InputError(f"The feature is a {fit.feature.kind}, its nominal a {nominal.kind}: choose one kind.")
-    points = points[np.isfinite(points).all(axis=1)]
+    points = points[finite_rows(points)]
     f = fit.feature
     if f.direction is None:
         reached = np.zeros((1, 3))
@@ -278,15 +271,13 @@ def position_error(
         """Twice how far a feature, moved by (k, 3), is off its nominal."""
         if feature.direction is None:
             return 2 * float(np.linalg.norm(feature.place + moved - nominal.place))
-        normal_or_axis = _direction_of(nominal)
+        normal_or_axis = nominal.unit_direction
         if feature.kind == "cylinder":
-            ends = feature.place + (reached @ _direction_of(f))[:, None] * _direction_of(feature) + moved
+            ends = feature.place + (reached @ f.unit_direction)[:, None] * feature.unit_direction + moved
             offsets = ends - nominal.place
-            return 2 * float(
-                np.linalg.norm(offsets - (offsets @ normal_or_axis)[:, None] * normal_or_axis, axis=1).max()
-            )
+            return 2 * float(lengths(offsets - (offsets @ normal_or_axis)[:, None] * normal_or_axis).max())
         # the plane's points under the measured ones
-        heights = reached - (reached @ _direction_of(feature))[:, None] * _direction_of(feature)
+        heights = reached - (reached @ feature.unit_direction)[:, None] * feature.unit_direction
         return 2 * float(np.abs((feature.place + heights + moved - nominal.place) @ normal_or_axis).max())
 
     shifts = np.zeros((DRAWS, len(reached), 3)) if moves is None else moves(f.place + reached)
@@ -303,7 +294,7 @@ def profile_error(
 ) -> Quantity:
     """Profile of a surface, mm: twice the largest deviation (n,) mm of points (n, 3) from the nominal, whose normals
     (n, 3) are given; NaN for points that do not belong to it. Raises InputError for too few points."""
-    counted = np.isfinite(deviations) & np.isfinite(normals).all(axis=1)
+    counted = np.isfinite(deviations) & finite_rows(normals)
     points, deviations, normals = (np.asarray(each[counted], np.float64) for each in (points, deviations, normals))
     if not len(points):
         raise InputError("No point of the region belongs to the nominal: select a region on it.")
@@ -367,11 +358,11 @@ def _axis_orientation(
     """The orientation of a cylinder's axis over its region to a datum: the diameter of its zone where both directions
     should agree (``along``), else its width."""
     f, d = fit.feature, datum.feature
-    length = float(np.ptp((points - f.place) @ _direction_of(f)))
+    length = float(np.ptp((points - f.place) @ f.unit_direction))
 
     def off(feature: Feature, reference: Feature) -> float:
         """How far the axis' ends lie apart across the requested direction."""
-        axis, direction = _direction_of(feature), _direction_of(reference)
+        axis, direction = feature.unit_direction, reference.unit_direction
         return length * float(np.linalg.norm(np.cross(axis, direction)) if along else abs(axis @ direction))
 
     steps = draw_steps(joint_covariance(fit.spread, datum.spread), np.random.default_rng(4))
@@ -395,6 +386,12 @@ def _smooth_basis(coordinates: np.ndarray, fitted: np.ndarray) -> tuple[np.ndarr
     return removed, whole[:, removed.shape[1] :], np.array(degrees)
 
 
+def _project_out(values: np.ndarray, *bases: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the columns (n, q + r) of orthonormal bases, and what they leave of values (n,)."""
+    whole = np.hstack(bases)
+    return whole, values - whole @ (whole.T @ values)
+
+
 def _span(columns: np.ndarray, without: np.ndarray | None = None) -> np.ndarray:
     """Orthonormal columns (n, r) that span those given, ``without`` what other orthonormal ones (n, q) span, and
     without directions that rounding alone distinguishes."""
@@ -405,7 +402,7 @@ def _span(columns: np.ndarray, without: np.ndarray | None = None) -> np.ndarray:
         for _ in range(2):  # once more, for what rounding left
             columns = columns - without @ (without.T @ columns)
     vectors, values, _ = np.linalg.svd(columns, full_matrices=False)
-    return np.asarray(vectors[:, values > SPAN_RATIO])
+    return vectors[:, values > SPAN_RATIO]
 
 
 def _even_weights(unrolled: np.ndarray) -> np.ndarray:
@@ -417,7 +414,7 @@ def _even_weights(unrolled: np.ndarray) -> np.ndarray:
     np.add.at(counts, place, 1)
     # means over the neighbourhood, which only cells with points count for
     sums, occupied = (uniform_filter(each, WINDOW, mode="constant") for each in (counts, np.sign(counts)))
-    return np.asarray(occupied[place] / sums[place])
+    return occupied[place] / sums[place]
 
 
 def _patch_misfit(
@@ -462,7 +459,7 @@ def _region_coordinates(points: np.ndarray, axes: int = 2) -> np.ndarray:
 
 def _cylinder_coordinates(f: Feature, points: np.ndarray) -> np.ndarray:
     """Cosine and sine of the angle about the axis, and the place along it in -1 to 1: (n, 3)."""
-    normals, axis = f.normals(points), _direction_of(f)
+    normals, axis = f.normals(points), f.unit_direction
     first = np.linalg.svd(axis[None])[2][1]
     along = (points - f.place) @ axis
     middle, half = (along.max() + along.min()) / 2, max(float(np.ptp(along)) / 2, 1e-12)
@@ -472,23 +469,15 @@ def _cylinder_coordinates(f: Feature, points: np.ndarray) -> np.ndarray:
 def _section_points(f: Feature, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The points of the section whose roundness is measured, and its normal (3,)."""
     if f.kind == "cylinder":
-        axis = _direction_of(f)
+        axis = f.unit_direction
         along = (points - f.place) @ axis
         middle, reach = (along.max() + along.min()) / 2, SECTION_SHARE * float(np.ptp(along)) / 2
         return points[np.abs(along - middle) <= reach], axis
     towards = points.mean(axis=0) - f.place
-    axis = np.cross(towards, np.eye(3)[np.argmin(np.abs(towards))])
-    axis /= np.linalg.norm(axis)
+    axis = unit_vectors(np.cross(towards, np.eye(3)[np.argmin(np.abs(towards))]))
     return points[np.abs((points - f.place) @ axis) <= SECTION_SHARE * (f.radius or 0.0)], axis
 
 
 def _nearest_rows(points: np.ndarray, places: np.ndarray) -> np.ndarray:
     """The rows (m,) of ``points`` (n, 3) nearest to places (m, 3)."""
-    return np.asarray(cKDTree(points).query(places)[1])
-
-
-def _direction_of(f: Feature) -> np.ndarray:
-    """The feature's direction (3,); InputError where it has none."""
-    if f.direction is None:
-        raise InputError(f"A {f.kind} has no direction: choose a plane or a cylinder.")
-    return f.direction
+    return cKDTree(points).query(places)[1]

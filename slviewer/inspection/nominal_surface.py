@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 
 from slviewer.errors import InputError
+from slviewer.geometry.vectors import box_middle, diagonal, lengths, unit_vectors
 from slviewer.registration.open3d_loader import open3d
 from slviewer.surface.shapes import Mesh
 from slviewer.surface.topology import half_edges
@@ -26,8 +27,8 @@ class NominalSurface:
         if not len(mesh.faces):
             raise InputError("The nominal model has no triangles: give a mesh.")
         vertices = mesh.vertices.astype(np.float64)
-        self.middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2  # casting in float32 is finest about 0
-        self.diagonal = float(np.linalg.norm(np.ptp(vertices, axis=0)))
+        self.middle = box_middle(vertices)  # casting in float32 is finest about 0
+        self.diagonal = diagonal(vertices)
         self._mesh: Any = trimesh.Trimesh(vertices - self.middle, mesh.faces, process=False)
         if not self._mesh.area > 0:
             raise InputError("The nominal model's triangles have no area: give another file.")
@@ -58,18 +59,17 @@ class NominalSurface:
         if at_side.any():
             some = self._smooth[self._faces[face[at_side]]]
             weights = np.stack([1 - s - t, s, t], axis=1)[at_side]
-            smooth = (some * weights[..., None]).sum(axis=1)
-            smooth /= np.maximum(np.linalg.norm(smooth, axis=1, keepdims=True), 1e-300)
-            lengths = np.linalg.norm(offsets[at_side], axis=1)
+            smooth = unit_vectors((some * weights[..., None]).sum(axis=1))
+            gaps = lengths(offsets[at_side])
             above = np.sum(smooth * offsets[at_side], axis=1)
             signs = np.where(above < 0, -1.0, 1.0)
-            away[at_side] = np.where(lengths > NEGLIGIBLE, signs * lengths, away[at_side])
+            away[at_side] = np.where(gaps > NEGLIGIBLE, signs * gaps, away[at_side])
             at_rim = (self._at_rim[self._faces[face[at_side]]] | (weights < CORNER)).all(axis=1)
-            beyond = at_rim & (np.abs(above) < RIM * lengths) & (lengths > NEGLIGIBLE)
+            beyond = at_rim & (np.abs(above) < RIM * gaps) & (gaps > NEGLIGIBLE)
             away[np.flatnonzero(at_side)[beyond]] = np.inf
             normals = normals.copy()
-            clear = lengths > 10 * NEGLIGIBLE
-            normals[np.flatnonzero(at_side)[clear]] = (signs / np.maximum(lengths, 1e-300))[clear, None] * offsets[
+            clear = gaps > 10 * NEGLIGIBLE
+            normals[np.flatnonzero(at_side)[clear]] = (signs / np.maximum(gaps, 1e-300))[clear, None] * offsets[
                 at_side
             ][clear]
         return away, normals
@@ -77,7 +77,7 @@ class NominalSurface:
     def seen_from(self, places: np.ndarray, facing: np.ndarray, view: np.ndarray, least: float) -> np.ndarray:
         """Return which places (n, 3) on the surface, facing (n, 3), are visible from far away in the direction ``view``
         (3,); ``least``: cosine between the two. Returns (n,) bool."""
-        is_visible: np.ndarray = facing @ view > least
+        is_visible = facing @ view > least
         lift = 1e-4 * self.diagonal
         origins = (places[is_visible] - self.middle + lift * facing[is_visible]).astype(np.float32)
         rays = np.concatenate([origins, np.broadcast_to(view, origins.shape)], axis=1).astype(np.float32)

@@ -7,6 +7,7 @@ from itertools import product
 import numpy as np
 
 from slviewer.errors import SlviewerError
+from slviewer.geometry.vectors import unit_vectors
 from slviewer.inspection.nominal_surface import NominalSurface
 from slviewer.registration.pairwise import MOST_ATTEMPTS, Registration, register_prepared, search_starts
 from slviewer.registration.prepared import PreparedScan, prepare_scan
@@ -24,7 +25,7 @@ LEAST_SCORE = 0.1
 """Share of the scan that must lie on the nominal after the coarse search: from there on a pose is refined. The part
 itself reaches 0.5 and more, other parts below 0.15."""
 VIEWS = [
-    np.array(view) / np.linalg.norm(view)
+    unit_vectors(np.array(view))
     for view in sorted(product((-1, 0, 1), repeat=3), key=lambda v: (np.count_nonzero(v), -abs(v[2])))[1:]
 ]
 """From where a model is looked at: its sides, from below and above first, then its edges, then its corners."""

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from slviewer.errors import InputError
+from slviewer.geometry.vectors import finite_rows, lengths
 from slviewer.surface.region_of_interest import box_edges
 
 MARGIN_MM = 1e-3
@@ -45,12 +46,12 @@ class Region:
 
     def within(self, points: np.ndarray) -> np.ndarray:
         """Bool like points (h, w, 3) or (n, 3) without their last axis; False for NaN."""
-        finite: np.ndarray = np.isfinite(points).all(axis=-1)
+        finite = finite_rows(points)
         offsets = np.where(finite[..., None], points - self.centre, 0.0)
         if self.kind == "ball":
-            return np.asarray(finite & (np.linalg.norm(offsets, axis=-1) <= self.size[0]))
+            return finite & (lengths(offsets) <= self.size[0])
         offsets = offsets if self.axes is None else offsets @ self.axes.T
-        return np.asarray(finite & (np.abs(offsets) <= self.size).all(axis=-1))
+        return finite & (np.abs(offsets) <= self.size).all(axis=-1)
 
     def edges(self) -> np.ndarray:
         """(12, 2, 3) mm: the edges of a box."""

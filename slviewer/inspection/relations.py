@@ -5,7 +5,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slviewer.errors import InputError
 from slviewer.inspection.features import KINDS, Feature
 from slviewer.inspection.quantities import Quantity, Unit
 from slviewer.inspection.uncertainty import Spread, joint_covariance, propagate_covariance
@@ -33,18 +32,18 @@ def _distance(a: Feature, b: Feature) -> float:
 
 def _angle(a: Feature, b: Feature) -> float:
     """Return the angle between two directions, 0 to 90 degrees."""
-    u, v = _axis_of(a), _axis_of(b)
+    u, v = a.unit_direction, b.unit_direction
     return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(u, v)), abs(u @ v))))
 
 
 def _offset(a: Feature, axis: Feature) -> float:
     """Return the distance in mm of a feature's place from an axis."""
-    return float(np.linalg.norm(np.cross(a.place - axis.place, _axis_of(axis))))
+    return float(np.linalg.norm(np.cross(a.place - axis.place, axis.unit_direction)))
 
 
 def _height(a: Feature, plane: Feature) -> float:
     """Return the signed distance in mm of a feature's place from a plane."""
-    return float((a.place - plane.place) @ _axis_of(plane))
+    return float((a.place - plane.place) @ plane.unit_direction)
 
 
 def _plane_gap(a: Feature, b: Feature) -> float:
@@ -56,20 +55,13 @@ def _axis_gap(a: Feature, b: Feature) -> float:
     """Return the shortest distance in mm between two axes, which may be parallel."""
     if _angle(a, b) < PARALLEL_DEG:
         return 0.5 * (_offset(a, b) + _offset(b, a))
-    across = np.cross(_axis_of(a), _axis_of(b))
+    across = np.cross(a.unit_direction, b.unit_direction)
     return float(abs((b.place - a.place) @ across) / np.linalg.norm(across))
 
 
 def _size(feature: Feature) -> float:
     """Return the feature's radius in mm; 0 where it has none."""
     return feature.radius or 0.0
-
-
-def _axis_of(feature: Feature) -> np.ndarray:
-    """Return the feature's direction (3,); InputError where it has none."""
-    if feature.direction is None:
-        raise InputError(f"A {feature.kind} has no direction.")
-    return feature.direction
 
 
 MEANINGS: dict[tuple[str, str], tuple[Meaning, ...]] = {

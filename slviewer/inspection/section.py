@@ -6,6 +6,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from slviewer.errors import InputError
+from slviewer.geometry.vectors import finite_rows, lengths, unit_vectors
 from slviewer.inspection.quantities import Quantity
 from slviewer.registration.open3d_loader import open3d
 
@@ -34,7 +35,7 @@ class CutPlane:
         across = up - (up @ along) * along
         if not np.linalg.norm(across) > 1e-3 * np.linalg.norm(up):
             raise InputError("The section's two points lie above one another: pick one beside the other.")
-        return cls(a, along, across / np.linalg.norm(across))
+        return cls(a, along, unit_vectors(across))
 
     @property
     def normal(self) -> np.ndarray:
@@ -43,7 +44,7 @@ class CutPlane:
 
     def drawn(self, points: np.ndarray) -> np.ndarray:
         """Return points (n, 3) in the drawing, (n, 2) mm: along and up."""
-        return np.asarray((points - self.origin) @ np.stack([self.along, self.up]).T)
+        return (points - self.origin) @ np.stack([self.along, self.up]).T
 
 
 def section(vertices: np.ndarray, faces: np.ndarray, plane: CutPlane) -> list[np.ndarray]:
@@ -67,7 +68,7 @@ def section(vertices: np.ndarray, faces: np.ndarray, plane: CutPlane) -> list[np
     places = vertices[edges[:, 0]] * (1 - share) + vertices[edges[:, 1]] * share
     drawn = plane.drawn(places)
     lines = [_order_line(drawn[chain]) for chain in _join_segments(segments, len(edges))]
-    return sorted(lines, key=lambda line: -float(np.linalg.norm(np.diff(line, axis=0), axis=1).sum()))
+    return sorted(lines, key=lambda line: -float(lengths(np.diff(line, axis=0)).sum()))
 
 
 def triangulate_near(points: np.ndarray, normals: np.ndarray, plane: CutPlane) -> tuple[np.ndarray, np.ndarray]:
@@ -76,7 +77,7 @@ def triangulate_near(points: np.ndarray, normals: np.ndarray, plane: CutPlane) -
     Balls roll over the points on the side of their ``normals`` (k, 3), three and six of the points' spacings in radius,
     so that wider gaps stay open (Bernardini et al. 1999). Raises InputError where no points lie near the plane.
     """
-    known = np.isfinite(normals).all(axis=1)
+    known = finite_rows(normals)
     points, normals = points[known].astype(np.float64), normals[known].astype(np.float64)
     some = points[:: max(1, len(points) // 2000)]
     spacing = float(np.median(cKDTree(points).query(some, k=2)[0][:, 1])) if len(points) > 1 else 0.0
@@ -158,5 +159,5 @@ def nearest_on_section(lines: list[np.ndarray], x: float, y: float | None = None
     heights = np.concatenate(met)
     if not heights.size:
         drawn = np.concatenate(lines)
-        return np.asarray(drawn[np.argmin(np.abs(drawn[:, 0] - x))])
+        return drawn[np.argmin(np.abs(drawn[:, 0] - x))]
     return np.array([x, heights.max() if y is None else heights[np.argmin(np.abs(heights - y))]])

@@ -7,6 +7,7 @@ from scipy.spatial import cKDTree
 
 from slviewer.errors import InputError
 from slviewer.geometry.shapes import fit_plane, fit_sphere
+from slviewer.geometry.vectors import lengths, unit_vectors
 from slviewer.inspection.features import Feature, Kind
 
 SAMPLE = 1000
@@ -61,7 +62,7 @@ def local_normals(sample: np.ndarray, points: np.ndarray) -> np.ndarray:
     _, near = cKDTree(thin).query(sample, k=min(count, len(thin)))
     patches = thin[near]
     patches = patches - patches.mean(axis=1, keepdims=True)
-    return np.asarray(np.linalg.eigh(np.einsum("nki,nkj->nij", patches, patches))[1][:, :, 0])
+    return np.linalg.eigh(np.einsum("nki,nkj->nij", patches, patches))[1][:, :, 0]
 
 
 def _fit_sample(kind: Kind, sample: np.ndarray, normals: np.ndarray | None, rng: np.random.Generator) -> Feature | None:
@@ -73,11 +74,8 @@ def _fit_sample(kind: Kind, sample: np.ndarray, normals: np.ndarray | None, rng:
     if kind == "plane":
         plane = fit_plane(some)
         return Feature("plane", some.mean(axis=0), plane.normal)
-    edges = some[1:] - some[0]
-    if abs(np.linalg.det(edges)) <= 1e-9 * np.linalg.norm(edges, axis=1).prod():
-        return None
-    offset = np.linalg.solve(2.0 * edges, (edges**2).sum(axis=1))
-    return Feature("sphere", some[0] + offset, None, float(np.linalg.norm(offset)))
+    offset = _offset_of_centre(some, 1e-9)
+    return None if offset is None else Feature("sphere", some[0] + offset, None, float(np.linalg.norm(offset)))
 
 
 def _cylinder_through(sample: np.ndarray, normals: np.ndarray, rng: np.random.Generator) -> Feature | None:
@@ -89,15 +87,22 @@ def _cylinder_through(sample: np.ndarray, normals: np.ndarray, rng: np.random.Ge
     if length < 0.05:
         return None
     axis /= length
-    u = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
-    u /= np.linalg.norm(u)
+    u = unit_vectors(np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))]))
     frame = np.stack([u, np.cross(axis, u)])
     flat = sample[[i, j, k]] @ frame.T
-    edges = flat[1:] - flat[0]
-    if abs(np.linalg.det(edges)) <= 1e-6 * np.linalg.norm(edges, axis=1).prod():
+    offset = _offset_of_centre(flat, 1e-6)
+    if offset is None:
         return None
-    offset = np.linalg.solve(2.0 * edges, (edges**2).sum(axis=1))
     return Feature("cylinder", (flat[0] + offset) @ frame, axis, float(np.linalg.norm(offset)))
+
+
+def _offset_of_centre(points: np.ndarray, flattest: float) -> np.ndarray | None:
+    """Return the centre (k,) of the sphere (circle) through points (k + 1, k), relative to the first; None for points
+    that are flatter than the share ``flattest``."""
+    edges = points[1:] - points[0]
+    if abs(np.linalg.det(edges)) <= flattest * lengths(edges).prod():
+        return None
+    return np.linalg.solve(2.0 * edges, (edges**2).sum(axis=1))
 
 
 def _median_distance(feature: Feature, points: np.ndarray) -> float:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from slviewer.errors import InputError
-from slviewer.evaluation.acceptance.figures import AcceptanceFigure, Decision, judge
+from slviewer.evaluation.acceptance.figures import AcceptanceFigure, Decision, judge_property
 from slviewer.inspection.deviation import Deviation
 
 DECIDED: dict[Decision, str] = {"pass": "pass", "fail": "fail", "undecided": "too close to tell"}
@@ -49,13 +49,13 @@ def judge_deviation(deviation: Deviation, sigma_mm: np.ndarray, tolerance_mm: fl
     inside, outside = off + U <= tolerance_mm, off - U > tolerance_mm
     numbers = deviation.statistics()
     ends = [AcceptanceFigure.of_length(LIMITED, end, numbers[end], typical / 2) for end in ("p_low", "p_high")]
-    decisions = [judge(LIMITED, [end], tolerance_mm).decision or "undecided" for end in ends]
+    decisions = [judge_property(LIMITED, [end], tolerance_mm).decision or "undecided" for end in ends]
     return ToleranceVerdict(
         tolerance_mm,
         typical,
         (ends[0].error_mm, decisions[0]),
         (ends[1].error_mm, decisions[1]),
-        judge(LIMITED, ends, tolerance_mm).decision or "undecided",
+        judge_property(LIMITED, ends, tolerance_mm).decision or "undecided",
         100 * float(np.mean(off <= tolerance_mm)),
         100 * float(inside.mean()),
         100 * float(outside.mean()),

@@ -10,6 +10,8 @@ from slviewer.calibration.splined.uncertainty import extrapolation_factor
 from slviewer.calibration.splined.volume import BestMotion, Volume, view_pixels, working_volume
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.cubes import occupied_cubes
+from slviewer.geometry.polynomial import grid_points
+from slviewer.geometry.vectors import finite_rows
 
 Shared = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """Called with points (m, 3) and how p parameters answer to their displacement (p, m, 3): (k, p), whose product with
@@ -40,7 +42,7 @@ class Spread:
     @property
     def sigmas(self) -> np.ndarray:
         """(p,): standard deviations."""
-        return np.asarray(np.sqrt(np.diag(self.covariance)))
+        return np.sqrt(np.diag(self.covariance))
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +72,7 @@ def joint_covariance(a: Spread, b: Spread) -> np.ndarray:
 def draw_steps(covariance: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Draw `DRAWS` steps (draws, p) of parameters of a covariance (p, p)."""
     values, vectors = np.linalg.eigh(covariance)
-    return np.asarray(rng.normal(size=(DRAWS, len(values))) * np.sqrt(np.maximum(values, 0)) @ vectors.T)
+    return rng.normal(size=(DRAWS, len(values))) * np.sqrt(np.maximum(values, 0)) @ vectors.T
 
 
 def propagate_covariance(f: Callable[[np.ndarray], float], covariance: np.ndarray) -> float:
@@ -107,7 +109,7 @@ def scatter_covariance(points: np.ndarray, jacobian: np.ndarray, residuals: np.n
     together = inverse @ (sums.T @ sums) @ inverse * count / (count - p)
     # elementwise larger standard deviations, with the correlations of the patches
     ratio = np.sqrt(np.maximum(np.diag(plain) / np.maximum(np.diag(together), 1e-300), 1.0))
-    return np.asarray(together * np.outer(ratio, ratio))
+    return together * np.outer(ratio, ratio)
 
 
 def splined_shared(bundle: Bundle, axis: Axis, scale: float = 1.0, scale_sigma: float = 0.0) -> Shared:
@@ -140,10 +142,9 @@ def _pixels(bundle: Bundle, points: np.ndarray) -> np.ndarray:
     rig = bundle.state.rig
     width, height = (float(n) for n in rig.camera.size)
     # the rays of a coarse grid give a start that is linear in the normalised point
-    u, v = np.meshgrid(np.linspace(0, width - 1, 9), np.linspace(0, height - 1, 7))
-    grid = np.column_stack([u.ravel(), v.ravel()])
+    grid = grid_points(np.linspace(0, width - 1, 9), np.linspace(0, height - 1, 7))
     rays = view_pixels(rig, grid, np.ones(len(grid)))[0]
-    known = np.isfinite(rays).all(axis=1)
+    known = finite_rows(rays)
     linear = np.linalg.lstsq(rays[known], grid[known], rcond=None)[0]
     pixels = points / points[:, 2:] @ linear
     for _ in range(6):

@@ -10,7 +10,7 @@ import numpy as np
 
 from slviewer.errors import InputError
 from slviewer.evaluation.acceptance.artefact import Artefact
-from slviewer.evaluation.acceptance.measure import SIZE, SPACING, Position, measure
+from slviewer.evaluation.acceptance.measure import SIZE, SPACING, Position, measure_artefact
 from slviewer.evaluation.acceptance.result import Acceptance, conclude_test
 from slviewer.evaluation.budget import Contribution, ErrorBudget
 from slviewer.evaluation.repeatability import Repeatability, repeatability
@@ -104,7 +104,7 @@ def accept(
             if certified.kind == "plane" and shot.role == "calibration":
                 plate = segment_board(store, shot, capture_texture(shot, frames), warn)
             try:
-                positions.append(measure(certified, cloud, captures[shot.name], shot.name, depth_range, plate))
+                positions.append(measure_artefact(certified, cloud, captures[shot.name], shot.name, depth_range, plate))
             except InputError as error:
                 raise InputError(f"{shot.name}: {error}") from error
         test = conclude_test(certified, name, positions)

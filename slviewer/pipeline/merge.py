@@ -32,7 +32,7 @@ from slviewer.reconstruction.cloud import Cloud
 from slviewer.records.merge import ContradictingPair, Loop, MarkerPair, Merge, RefusedPair, Registered
 from slviewer.records.plain import from_plain
 from slviewer.registration.markers import MeasuredMarkers, fit_marker_pose, marker_notes, measure_markers
-from slviewer.registration.multiway import Alignment, Pair, Starts
+from slviewer.registration.multiway import MultiwayAlignment, Pair, Starts
 from slviewer.registration.pairwise import Registration
 from slviewer.registration.picked import fit_picked_start
 from slviewer.registration.refusal import Refused
@@ -61,7 +61,7 @@ class MergedScans:
     comes from, 0 for the first of ``fused.names``.
     """
 
-    alignment: Alignment
+    alignment: MultiwayAlignment
     fused: Fused
     clouds: Mapping[str, Cloud]
     found: Found[Merge]
@@ -278,7 +278,7 @@ def _measure_mat(
     return measured
 
 
-def _list_moved_markers(alignment: Alignment) -> list[str]:
+def _list_moved_markers(alignment: MultiwayAlignment) -> list[str]:
     """A sentence for each pair between whose scans markers have moved."""
     return [
         f"{a} -> {b}: marker {', '.join(map(str, pose.moved))} has moved between the scans, and is ignored: "

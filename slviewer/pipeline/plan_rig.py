@@ -10,8 +10,15 @@ import numpy as np
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import InputError
 from slviewer.evaluation.plane import evaluate_plane
-from slviewer.evaluation.rig_plan import DARK_LEVEL, PEAK_LEVEL, PlannedCamera, PlannedLight, PlannedProjector, RigPlan
-from slviewer.evaluation.rig_plan import plan_rig as predict_rig
+from slviewer.evaluation.rig_plan import (
+    DARK_LEVEL,
+    PEAK_LEVEL,
+    PlannedCamera,
+    PlannedLight,
+    PlannedProjector,
+    RigPlan,
+    predict_rig,
+)
 from slviewer.fringe.decode import decode
 from slviewer.fringe.presets import complementary
 from slviewer.fringe.sequence import one_axis

@@ -29,19 +29,7 @@ def select_consistent_edges(
     inconsistent edges fit each other, by ``is_good_fit(edge, T_onto_scan)``. Raises ``Refused`` where that does not
     decide. ``gates``: registration gate of each edge, mm.
     """
-    rng = np.random.default_rng(0)
-    costs = np.array([edge.variance for edge in edges])
-    hypotheses: dict[frozenset[int], np.ndarray] = {}
-    for trial in range(_TREES):
-        poses, tree = graph.spanning_poses(
-            nodes, edges, root, costs if trial == 0 else costs * np.exp(rng.normal(0, 3, len(edges)))
-        )
-        inconsistent = frozenset(
-            k for k in range(len(edges)) if k not in tree and not _is_consistent(k, edges, tree, poses, gates)
-        )
-        hypotheses.setdefault(inconsistent, poses)
-        if not inconsistent:
-            return list(range(len(edges))), {}
+    hypotheses = _list_hypotheses(nodes, edges, root, gates)
     fewest = min(len(dropped) for dropped in hypotheses)
     best = [(dropped, poses) for dropped, poses in hypotheses.items() if len(dropped) == fewest]
     if len(best) > 1:
@@ -60,9 +48,31 @@ def select_consistent_edges(
             "angle.",
         )
     dropped, poses = best[0]
-    dropped_gaps = {k: graph.loop_gap(edges[k], poses) for k in dropped}
+    gaps_by_edge = {k: graph.loop_gap(edges[k], poses) for k in dropped}
     consistent = [k for k in range(len(edges)) if k not in dropped]
-    return consistent, {k: (gap.shift_mm, gap.turn_deg) for k, gap in dropped_gaps.items()}
+    return consistent, {k: (gap.shift_mm, gap.turn_deg) for k, gap in gaps_by_edge.items()}
+
+
+def _list_hypotheses(
+    nodes: int, edges: Sequence[Edge], root: int, gates: Sequence[float]
+) -> dict[frozenset[int], np.ndarray]:
+    """Return the edges that are inconsistent with random spanning trees, with the poses (n, 4, 4) by the first of each.
+
+    Only the empty set where one tree is consistent with all edges.
+    """
+    rng = np.random.default_rng(0)
+    costs = np.array([edge.variance for edge in edges])
+    hypotheses: dict[frozenset[int], np.ndarray] = {}
+    for trial in range(_TREES):
+        drawn = costs if trial == 0 else costs * np.exp(rng.normal(0, 3, len(edges)))
+        poses, tree = graph.spanning_poses(nodes, edges, root, drawn)
+        inconsistent = frozenset(
+            k for k in range(len(edges)) if k not in tree and not _is_consistent(k, edges, tree, poses, gates)
+        )
+        if not inconsistent:
+            return {inconsistent: poses}
+        hypotheses.setdefault(inconsistent, poses)
+    return hypotheses
 
 
 def _is_consistent(

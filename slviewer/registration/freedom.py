@@ -12,6 +12,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from slviewer.geometry.rigid import move_points
+from slviewer.geometry.vectors import rms_length
 from slviewer.registration.prepared import PreparedScan
 
 Shape = Literal["plane", "sphere", "cylinder", "slides", "turns"]
@@ -74,7 +75,7 @@ def estimate_freedom(
     is_opposite = np.sum(scan_normals * reference_normals, axis=1, keepdims=True) < 0
     scan_normals = np.where(is_opposite, -scan_normals, scan_normals)
     arm = points - points.mean(axis=0)
-    arm /= float(np.sqrt(np.mean(np.sum(arm**2, axis=1))))
+    arm /= rms_length(arm)
     A, B = (np.hstack([np.cross(arm, normals), normals]) for normals in (reference_normals, scan_normals))
     information = A.T @ B / len(points)
     values, vectors = np.linalg.eigh((information + information.T) / 2)

@@ -155,7 +155,7 @@ def _build_problem(
 
     def cost(x: np.ndarray) -> np.ndarray:
         """Return the whitened residuals (6 m,) of the edges."""
-        return np.asarray(np.einsum("kij,kj->ki", whitening, edge_residuals(edges, apply_step(x))).ravel())
+        return np.einsum("kij,kj->ki", whitening, edge_residuals(edges, apply_step(x))).ravel()
 
     return apply_step, cost, middle
 

@@ -12,8 +12,9 @@ import cv2
 import numpy as np
 
 from slviewer.errors import InputError
-from slviewer.geometry.rigid import Floats, fit_rigid, move_points
+from slviewer.geometry.rigid import Floats, fit_rigid, motion_jacobian, move_points
 from slviewer.geometry.robust import robust_sigma, tukey_weights
+from slviewer.geometry.vectors import diagonal, lengths, rms_length
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.registration.refusal import Refused
 from slviewer.registration.uncertainty import Uncertainty
@@ -59,8 +60,7 @@ class MarkerPose:
     @property
     def rms_mm(self) -> float:
         """Root mean square distance of the corners."""
-        gap = move_points(self.T, self.scan_corners) - self.reference_corners
-        return float(np.sqrt(np.mean(np.sum(gap**2, axis=1))))
+        return rms_length(move_points(self.T, self.scan_corners) - self.reference_corners)
 
     def inverse(self) -> "MarkerPose":
         """The pose of the reference on the scan."""
@@ -72,7 +72,7 @@ class MarkerPose:
         about ``centre`` (3,) and a shift, as those of residuals of ``sigma_mm``."""
         placed = move_points(T, self.scan_corners)
         weight = (sigma_mm / self.sigma_mm) ** 2
-        J = corner_jacobian(placed - centre)
+        J = motion_jacobian(placed - centre)
         H = np.einsum("mij,mik,m->jk", J, J, weight)
         return H, np.einsum("mij,mi,m->j", J, placed - self.reference_corners, weight)
 
@@ -81,15 +81,6 @@ class MarkerPose:
         """Uncertainty of the pose about the corners' middle."""
         centre = move_points(self.T, self.scan_corners).mean(axis=0)
         return Uncertainty(np.linalg.inv(self.normal_equations(self.T, centre, 1.0)[0]), centre)
-
-
-def corner_jacobian(arm: Floats) -> Floats:
-    """Derivatives (m, 3, 6) of points ``arm`` (m, 3) mm from the centre by a small rotation (rad) and shift (mm)."""
-    J = np.zeros((len(arm), 3, 6))
-    J[:, :, 3:] = np.eye(3)
-    for k, (a, b) in enumerate(((1, 2), (2, 0), (0, 1))):  # rotation x arm
-        J[:, a, k], J[:, b, k] = -arm[:, b], arm[:, a]
-    return J
 
 
 def measure_markers(cloud: Cloud) -> MeasuredMarkers:
@@ -115,7 +106,7 @@ def measure_markers(cloud: Cloud) -> MeasuredMarkers:
 def _measure_corner(cloud: Cloud, corner: np.ndarray, quad: np.ndarray) -> tuple[Floats, float] | None:
     """Return the point (3,) mm at a corner (2,) px of a marker ``quad`` (4, 2) px, and its standard deviation; None
     where too little of the surface around it was measured."""
-    reach = _FIT_REACH * float(np.linalg.norm(quad - np.roll(quad, 1, axis=0), axis=1).mean())
+    reach = _FIT_REACH * float(lengths(quad - np.roll(quad, 1, axis=0)).mean())
     height, width = cloud.points.shape[:2]
     (left, top), (right, bottom) = np.floor(corner - reach).astype(int), np.ceil(corner + reach).astype(int) + 1
     left, top, right, bottom = max(left, 0), max(top, 0), min(right, width), min(bottom, height)
@@ -208,13 +199,13 @@ def _select_steady(p: Floats, q: Floats, sigma: Floats) -> np.ndarray:
         steady = gap < limit
         if steady.sum() < 2:
             break
-    extent = float(np.linalg.norm(np.ptp(q.reshape(-1, 3), axis=0)))
+    extent = diagonal(q.reshape(-1, 3))
     return steady & (usual < max(MOVED_MM, MOST_GAP * extent))
 
 
 def _largest_gaps(T: Floats, p: Floats, q: Floats) -> Floats:
     """Return the largest gap (n,) mm of each marker's corners after a motion (4, 4)."""
-    return np.asarray(np.linalg.norm(move_points(T, p) - q, axis=2).max(axis=1))
+    return lengths(move_points(T, p) - q).max(axis=1)
 
 
 def marker_notes(measured: Mapping[str, MeasuredMarkers]) -> list[str]:

@@ -76,7 +76,7 @@ class Loop:
 
 
 @dataclass(frozen=True, eq=False)
-class Alignment:
+class MultiwayAlignment:
     """Result of a multiway registration.
 
     ``T_reference_scan`` (4, 4) mm by name, into the frame of ``reference``, with ``uncertainties``. ``pairs``: the
@@ -116,7 +116,7 @@ def register_all(
     reference: str,
     starts: Starts | None = None,
     progress: Progress | None = None,
-) -> Alignment:
+) -> MultiwayAlignment:
     """Register 2 to 255 scans, by name in the order of capture, into the frame of the one called ``reference``.
 
     ``progress`` receives the completed share of the work, 0 to 1, and may raise to cancel.
@@ -157,7 +157,7 @@ class _PoseGraphBuilder:
         self.markers = self._fit_markers()
         self.expected = len(self._list_first_pairs()) + (_LOOP_PAIRS * len(scans) if len(scans) > ALL_PAIRS else 0)
 
-    def build(self) -> Alignment:
+    def build(self) -> MultiwayAlignment:
         """Register pairs until all scans are connected, close loops, and optimise the poses."""
         for pair, start in (self.starts.picked or {}).items():
             self._register(pair, start)
@@ -376,7 +376,7 @@ class _PoseGraphBuilder:
         """Return ``graph.spanning_poses`` of all registered pairs."""
         return graph.spanning_poses(len(self.names), self._edges(), self.root)
 
-    def _optimise(self) -> Alignment:
+    def _optimise(self) -> MultiwayAlignment:
         """Drop contradicting pairs and optimise the poses of all scans."""
         self._report(0.92)
         pairs, edges = list(self.registered), self._edges()
@@ -397,7 +397,7 @@ class _PoseGraphBuilder:
                 names = tuple(self.names[node] for node in graph.loop_nodes(edge, edges, tree))
                 loops.append(Loop(names, graph.loop_gap(edge, start, expected), graph.loop_gap(edge, poses)))
         self._report(1.0)
-        return Alignment(
+        return MultiwayAlignment(
             self.reference,
             dict(zip(self.names, poses, strict=True)),
             dict(zip(self.names, graph.pose_uncertainties(poses, edges, self.root), strict=True)),

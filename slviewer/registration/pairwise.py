@@ -11,6 +11,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from slviewer.errors import InputError
+from slviewer.geometry.rigid import move_points
+from slviewer.geometry.vectors import rms
 from slviewer.registration.freedom import WORDS, Freedom, estimate_freedom
 from slviewer.registration.markers import MOVED_MM, MarkerPose
 from slviewer.registration.open3d_loader import align_icp, open3d
@@ -69,25 +71,23 @@ def register(
     *,
     scan_normals: np.ndarray | None = None,
     reference_normals: np.ndarray | None = None,
-    sigma_mm: float | None = None,
     initial: np.ndarray | Candidate | None = None,
     progress: Progress | None = None,
 ) -> Registration:
     """Align a scan with a reference that shows part of the same object.
 
     Points are ``(n, 3)`` mm without NaN, each in the frame of the camera that took it; normals ``(n, 3)`` point to that
-    camera, and are estimated where missing. ``sigma_mm`` is the expected error of one point, when it is known: gates
-    are never narrower than noise. ``initial`` replaces the search for a start: the last pose (4, 4), or a ``Candidate``
-    such as ``picked.picked_start`` gives. ``progress`` receives the share of the work done,
-    0 to 1, and may raise to cancel.
+    camera, and are estimated where missing. ``initial`` replaces the search for a start: the last pose (4, 4), or a
+    ``Candidate`` such as ``picked.fit_picked_start`` gives. ``progress`` receives the share of the work done, 0 to 1,
+    and may raise to cancel.
 
     Raises ``Refused`` where nothing aligns, where too little overlaps, where the shape does not hold the pose, or where
     a second pose fits alike.
     """
     report = progress or (lambda share: None)
     report(0.0)
-    scan = prepare_scan("scan", scan_points, scan_normals, sigma_mm)
-    reference = prepare_scan("reference", reference_points, reference_normals, sigma_mm)
+    scan = prepare_scan("scan", scan_points, scan_normals)
+    reference = prepare_scan("reference", reference_points, reference_normals)
     report(0.3)
     return register_prepared(scan, reference, initial=initial, progress=lambda share: report(0.3 + 0.7 * share))
 
@@ -204,7 +204,7 @@ def _compute_figures(
     """Compute the figures of a pose ``T`` (4, 4) from up to 50,000 scan points, and the freedom of the overlap."""
     spacing = reference.spacing
     gate = max(gate, 2.0 * spacing)
-    points = scan.points[:: -(-len(scan.points) // _STATISTICS_POINTS)] @ T[:3, :3].T + T[:3, 3]
+    points = move_points(T, scan.points[:: -(-len(scan.points) // _STATISTICS_POINTS)])
     distance, nearest = reference.tree.query(points, distance_upper_bound=4.0 * gate, workers=-1)
     near = np.isfinite(distance)
     points, distance, counterpart = points[near], distance[near], reference.points[nearest[near]]
@@ -214,12 +214,12 @@ def _compute_figures(
     overlapping = distance < gate
     lateral = np.sqrt(np.maximum(distance**2 - height**2, 0.0))
     facing = lateral < spacing + 0.25 * height  # a point beyond the reference's rim faces nothing
-    rms = _rms(height[overlapping])
-    held = estimate_freedom(scan, reference, T, counterpart[overlapping], rms)
+    error = _rms(height[overlapping])
+    held = estimate_freedom(scan, reference, T, counterpart[overlapping], error)
     nowhere = Uncertainty(np.full((6, 6), np.inf), np.full(3, np.nan))
     figures = Registration(
         T_reference_scan=T,
-        rms_mm=rms,
+        rms_mm=error,
         inlier_rmse_mm=_rms(distance[overlapping]),
         overlap=float(overlapping.sum() / near.size),
         agreement=float((facing & (height < gate)).sum() / max(1, facing.sum())),
@@ -233,7 +233,7 @@ def _compute_figures(
 
 def _rms(values: np.ndarray) -> float:
     """Return the root mean square; NaN for an empty array."""
-    return float(np.sqrt(np.mean(np.square(values)))) if values.size else float("nan")
+    return rms(values) if values.size else float("nan")
 
 
 def _refuse_if_doubtful(result: Registration, held: Freedom | None, size: float) -> None:

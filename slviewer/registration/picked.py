@@ -4,6 +4,7 @@ import numpy as np
 
 from slviewer.errors import InputError
 from slviewer.geometry.rigid import fit_rigid, move_points
+from slviewer.geometry.vectors import diagonal, lengths
 from slviewer.registration.refusal import Refused
 from slviewer.registration.start import Candidate
 
@@ -37,8 +38,8 @@ def fit_picked_start(scan_points: np.ndarray, reference_points: np.ndarray) -> t
                 "pick one more beside it.",
             )
     T = fit_rigid(p, q)
-    residual = np.linalg.norm(move_points(T, p) - q, axis=1)
-    extent = float(np.linalg.norm(np.ptp(q, axis=0)))
+    residual = lengths(move_points(T, p) - q)
+    extent = diagonal(q)
     if residual.max() > _WORST * extent:
         raise Refused(
             "picks",

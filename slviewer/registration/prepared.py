@@ -8,6 +8,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from slviewer.errors import InputError
+from slviewer.geometry.vectors import lengths
 from slviewer.registration.open3d_loader import open3d
 
 LEAST_POINTS = 500
@@ -65,12 +66,6 @@ class PreparedScan:
         cloud.estimate_normals(open3d().geometry.KDTreeSearchParamKNN(30))
         return np.asarray(cloud.points), np.asarray(cloud.normals)
 
-    @property
-    def scale(self) -> float:
-        """Scale factor of voxels and gates: 1 for objects of 75 to 300 mm, in proportion for smaller and larger
-        ones."""
-        return scale_of(self.size)
-
     def features(self, voxel: float) -> Any:
         """Return Open3D's FPFH features of the cloud thinned to ``voxel`` mm; cached."""
         if voxel not in self._features:
@@ -100,7 +95,7 @@ def prepare_scan(
     """
     _check_arrays(name, points, normals)
     points = np.ascontiguousarray(points, dtype=np.float64)
-    size = _size(points)
+    size = measure_size(points)
     if not size > 0:
         raise InputError(f"Nearly all points of the {name} are one: give those that were measured, each once.")
     voxel = FINEST_MM * scale_of(size)
@@ -132,7 +127,7 @@ def _check_arrays(name: str, points: np.ndarray, normals: np.ndarray | None) -> 
         raise InputError(f"The {name} has {len(points)} points and normals of shape {normals.shape}: give one each.")
 
 
-def _size(points: np.ndarray) -> float:
+def measure_size(points: np.ndarray) -> float:
     """Return the longest side in mm of the points' bounding box between their 1st and 99th percentiles."""
     low, high = np.percentile(points[:: max(1, len(points) // 100_000)], (1.0, 99.0), axis=0)
     return float((high - low).max())
@@ -157,7 +152,7 @@ def _make_cloud(points: np.ndarray, normals: np.ndarray | None, voxel: float) ->
         finite = np.nan_to_num(np.asarray(normals, dtype=np.float64))  # a NaN normal weighs nothing in a voxel's mean
         cloud.normals = o3d.utility.Vector3dVector(finite)
         cloud = cloud.voxel_down_sample(voxel)
-        known = np.linalg.norm(np.asarray(cloud.normals), axis=1) > 0.1
+        known = lengths(np.asarray(cloud.normals)) > 0.1
         cloud = cloud.select_by_index(np.flatnonzero(known))
         cloud.normalize_normals()
     else:
@@ -165,5 +160,5 @@ def _make_cloud(points: np.ndarray, normals: np.ndarray | None, voxel: float) ->
         cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(30))
         cloud.orient_normals_towards_camera_location(np.zeros(3))
     seen = np.asarray(cloud.points)
-    facing = -np.sum(np.asarray(cloud.normals) * seen, axis=1) / np.linalg.norm(seen, axis=1)
+    facing = -np.sum(np.asarray(cloud.normals) * seen, axis=1) / lengths(seen)
     return cloud.select_by_index(np.flatnonzero(facing > _GRAZING))

@@ -13,6 +13,7 @@ import numpy as np
 from slviewer.geometry.cubes import occupied_cubes
 from slviewer.geometry.rigid import move_points, turn_about
 from slviewer.geometry.robust import robust_sigma, tukey_weights
+from slviewer.geometry.vectors import diagonal, rms_length
 from slviewer.registration.markers import MarkerPose
 from slviewer.registration.prepared import PreparedScan
 from slviewer.registration.uncertainty import Uncertainty
@@ -63,9 +64,7 @@ def refine_pose(
         if pairs is None:
             return RefinedPose(T, gate, None)
         points, normal, residual = pairs
-        centre = points.mean(axis=0)
-        sigma = max(robust_sigma(residual, about=0.0), 1e-6)
-        J, weight = _jacobian(points - centre, normal), tukey_weights(residual, sigma)
+        centre, sigma, J, weight = _weigh_pairs(points, normal, residual)
         H, gradient = (J * weight[:, None]).T @ J, J.T @ (weight * residual)
         if markers is not None:
             H_markers, gradient_markers = markers.normal_equations(T, centre, sigma * np.sqrt(_count_alike(points)))
@@ -73,7 +72,7 @@ def refine_pose(
         step = -np.linalg.lstsq(H, gradient, rcond=1e-10)[0]
         T = turn_about(step[:3], centre, step[3:]) @ T
         next_gate = min(gate, max(3.0 * sigma, narrowest))
-        motion = np.linalg.norm(step[3:]) + np.linalg.norm(step[:3]) * np.linalg.norm(np.ptp(points, axis=0))
+        motion = np.linalg.norm(step[3:]) + np.linalg.norm(step[:3]) * diagonal(points)
         if next_gate > 0.99 * gate and motion < (_SETTLED_MM if stride == least else _NEAR_MM):
             if stride == least:
                 break
@@ -115,12 +114,17 @@ def _count_alike(points: np.ndarray) -> float:
     return max(1.0, len(points) / _INDEPENDENT)
 
 
-def _jacobian(arm: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """Return the derivatives (n, 6) of point-to-plane residuals by a small rotation (rad) and translation (mm).
+def _weigh_pairs(
+    points: np.ndarray, normal: np.ndarray, residual: np.ndarray
+) -> tuple[np.ndarray, float, np.ndarray, np.ndarray]:
+    """Return the middle (3,) of the pairs' points (n, 3), the residuals' noise in mm, and their weights (n,).
 
-    ``arm`` (n, 3) mm: the points less the centre of rotation.
+    Before the weights: the derivatives (n, 6) of the residuals by a small rotation (rad) about the middle and a
+    translation (mm).
     """
-    return np.hstack([np.cross(arm, normal), normal])
+    centre = points.mean(axis=0)
+    sigma = max(robust_sigma(residual, about=0.0), 1e-6)
+    return centre, sigma, np.hstack([np.cross(points - centre, normal), normal]), tukey_weights(residual, sigma)
 
 
 def _estimate_uncertainty(
@@ -128,15 +132,13 @@ def _estimate_uncertainty(
 ) -> Uncertainty | None:
     """Estimate the uncertainty of a pose ``T`` (4, 4) from its pairs by a cluster-robust covariance, and from the
     standard deviations of markers; None for too few patches."""
-    centre = points.mean(axis=0)
+    centre, sigma, J, weight = _weigh_pairs(points, normal, residual)
     arm = points - centre
-    sigma = max(robust_sigma(residual, about=0.0), 1e-6)
-    J, weight = _jacobian(arm, normal), tukey_weights(residual, sigma)
     H = (J * weight[:, None]).T @ J
     gradient = J * (weight * residual)[:, None]
     alike = _count_alike(points)
     H_markers = np.zeros((6, 6)) if markers is None else markers.normal_equations(T, centre, sigma * np.sqrt(alike))[0]
-    diameter = 2.0 * float(np.sqrt(np.mean(np.sum(arm**2, axis=1))))
+    diameter = 2.0 * rms_length(arm)
     largest = None
     for share in _PATCHES:
         patches = _sum_by_cube(gradient, arm, diameter / share)

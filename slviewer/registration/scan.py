@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import binary_erosion
 
+from slviewer.geometry.vectors import lengths
 from slviewer.reconstruction.cloud import Cloud, choose_pixels
 from slviewer.reconstruction.reconstruct import normals as grid_normals
 
@@ -52,27 +53,19 @@ def away_from_edges(points: np.ndarray, sigma_z: np.ndarray | None = None) -> np
     Edges are invalid pixels, the image's border, and steps that are steep for the pixels' pitch and exceed the noise
     ``sigma_z`` (h, w) mm of both pixels, where it is known.
     """
-    valid = np.isfinite(points[..., 2])
-    noise = np.zeros(valid.shape) if sigma_z is None else _NOISE * np.nan_to_num(sigma_z, posinf=0.0)
-    inside = valid.copy()
+    inside = np.isfinite(points[..., 2])
+    noise = np.zeros(inside.shape) if sigma_z is None else _NOISE * np.nan_to_num(sigma_z, posinf=0.0)
     for axis in (0, 1):
-        first, second = (
-            points[tuple(s if k == axis else slice(None) for k in (0, 1))] for s in (_BUT_LAST, _BUT_FIRST)
-        )
-        pitch = np.linalg.norm((second - first)[..., :2], axis=-1)
+        before, after = (np.s_[:-1], np.s_[1:]) if axis == 0 else (np.s_[:, :-1], np.s_[:, 1:])
+        pitch = lengths((points[after] - points[before])[..., :2])
         known = pitch[np.isfinite(pitch)]
         if not known.size:
             continue
-        noisy = np.hypot(
-            *(noise[tuple(s if k == axis else slice(None) for k in (0, 1))] for s in (_BUT_LAST, _BUT_FIRST))
-        )
-        step = np.abs(second[..., 2] - first[..., 2]) > _STEEPEST * float(np.median(known)) + noisy
-        for s in (_BUT_LAST, _BUT_FIRST):
-            inside[tuple(s if k == axis else slice(None) for k in (0, 1))] &= ~step
-    return np.asarray(binary_erosion(inside, np.ones((3, 3), bool), _RIM_PX))
-
-
-_BUT_LAST, _BUT_FIRST = slice(None, -1), slice(1, None)
+        rise = np.abs(points[after][..., 2] - points[before][..., 2])
+        is_step = rise > _STEEPEST * float(np.median(known)) + np.hypot(noise[before], noise[after])
+        inside[before] &= ~is_step
+        inside[after] &= ~is_step
+    return binary_erosion(inside, np.ones((3, 3), bool), _RIM_PX)
 
 
 def _rgb(colours: np.ndarray | None) -> np.ndarray | None:

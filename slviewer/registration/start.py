@@ -11,6 +11,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from slviewer.geometry.rigid import fit_rigid, move_points, rigid_transform
+from slviewer.geometry.vectors import diagonal, lengths
 from slviewer.registration.open3d_loader import align_icp, open3d
 from slviewer.registration.prepared import PreparedScan
 
@@ -76,7 +77,7 @@ def pose_distance(points: np.ndarray, T: np.ndarray, other: np.ndarray) -> float
 def _score_pose(scan: Any, reference: Any, tree: cKDTree, T: np.ndarray, voxel: float) -> float:
     """Return the share of the scan that overlaps the reference, times the share of agreement where the two face each
     other."""
-    points = np.asarray(scan.points) @ T[:3, :3].T + T[:3, 3]
+    points = move_points(T, np.asarray(scan.points))
     normals = np.asarray(scan.normals) @ T[:3, :3].T
     distance, nearest = tree.query(points, distance_upper_bound=3.0 * voxel)
     near = np.isfinite(distance)
@@ -101,7 +102,7 @@ def _feature_poses(scanned: PreparedScan, referred: PreparedScan, voxel: float) 
     n, m = np.asarray(scan.normals)[matches[:, 0]], np.asarray(reference.normals)[matches[:, 1]]
 
     triplets = np.random.default_rng(_SEED).integers(0, len(p), (_TRIPLETS, 3))
-    span = float(np.linalg.norm(np.ptp(p, axis=0)))
+    span = diagonal(p)
     triplets = triplets[_match_triangles(p[triplets], q[triplets], 0.1 * span, voxel)][:2000]
     if len(triplets) == 0:
         return []
@@ -129,5 +130,5 @@ def _feature_poses(scanned: PreparedScan, referred: PreparedScan, voxel: float) 
 def _match_triangles(p: np.ndarray, q: np.ndarray, shortest: float, slack: float) -> np.ndarray:
     """Return which pairs of triangles ``(k, 3, 3)`` have sides longer than ``shortest`` that agree within ``slack``
     mm."""
-    a, b = (np.linalg.norm(x - np.roll(x, 1, axis=1), axis=2) for x in (p, q))
+    a, b = (lengths(x - np.roll(x, 1, axis=1)) for x in (p, q))
     return np.all((a > shortest) & (np.abs(a - b) < slack), axis=1)

@@ -13,11 +13,12 @@ from scipy.spatial import cKDTree
 
 from slviewer.errors import InputError
 from slviewer.geometry.rigid import move_points
+from slviewer.geometry.vectors import lengths
 from slviewer.reconstruction.cloud import Cloud, choose_pixels
-from slviewer.registration.multiway import Alignment, Pair, Starts, register_all
+from slviewer.registration.multiway import MultiwayAlignment, Pair, Starts, register_all
 from slviewer.registration.open3d_loader import open3d
 from slviewer.registration.pairwise import Progress
-from slviewer.registration.prepared import LEAST_POINTS, sort_spatially
+from slviewer.registration.prepared import LEAST_POINTS, measure_size, sort_spatially
 from slviewer.registration.refusal import Refused
 
 SIGMAS = 5.0
@@ -83,7 +84,7 @@ class ObjectAlignment:
     ``contradictions``: the free-space violations that remain, of each registered pair.
     """
 
-    alignment: Alignment
+    alignment: MultiwayAlignment
     clouds: Mapping[str, Cloud]
     static: Mapping[str, np.ndarray]
     contradictions: Mapping[Pair, SceneContradiction]
@@ -101,36 +102,22 @@ def register_object(
     ``progress`` receives the completed share of the work, 0 to 1, and may raise to cancel.
     """
     report = progress or (lambda share: None)
-    all_samples = {name: sample_surface(_select_precise(cloud)) for name, cloud in clouds.items()}
+    all_samples = _sample_clouds(clouds)
     markers = starts.markers if starts is not None else None
-    alignment, static = None, _detect_unmoved_points(clouds, all_samples)
-    if markers:  # they tell how the object moved, also where a plane in its own plane seems to stand still
-        static = {name: np.zeros_like(mask) for name, mask in static.items()}
-    if any(mask.any() for mask in static.values()):
-        alignment = _try_register(remove_points(clouds, static), reference, starts, lambda share: report(0.5 * share))
-        if alignment is not None:
-            static = detect_static_points(clouds, all_samples, alignment)
-            if not any(mask.any() for mask in static.values()):
-                alignment = None
-    if alignment is None:
-        alignment = register_all(clouds, reference, starts, lambda share: report(0.5 + 0.2 * share))
-        static = detect_static_points(clouds, all_samples, alignment)
+    alignment, static = _register_once(clouds, all_samples, reference, starts, report)
     first_start = {pair: registration.start for pair, registration in alignment.pairs.items()}
     moving, samples = clouds, all_samples
     for _ in range(ROUNDS):
-        if not any(mask.any() for mask in static.values()):
+        if not _has_points(static):
             break
         candidate = remove_points(clouds, static)
-        refined = _try_register(
-            candidate, reference, Starts(poses=alignment.T_reference_scan, markers=markers), lambda share: report(0.9)
-        )
+        again = Starts(poses=alignment.T_reference_scan, markers=markers)
+        refined = _try_register(candidate, reference, again, lambda share: report(0.9))
         if refined is None:  # too few points remain of a scan: its background may be needed to determine its pose
-            static = {name: np.zeros_like(mask) for name, mask in static.items()}
-            moving, samples = clouds, all_samples
+            moving, samples, static = clouds, all_samples, _no_points(clouds)
             break
         pairs = {pair: replace(r, start=first_start.get(pair, r.start)) for pair, r in refined.pairs.items()}
-        alignment, moving = replace(refined, pairs=pairs), candidate
-        samples = {name: sample_surface(_select_precise(cloud)) for name, cloud in moving.items()}
+        alignment, moving, samples = replace(refined, pairs=pairs), candidate, _sample_clouds(candidate)
         before, static = static, detect_static_points(clouds, all_samples, alignment)
         if all(np.count_nonzero(static[n] ^ before[n]) < SETTLED * before[n].size for n in static):
             static = before
@@ -142,6 +129,45 @@ def register_object(
     }
     report(1.0)
     return ObjectAlignment(alignment, moving, static, contradictions)
+
+
+def _register_once(
+    clouds: Mapping[str, Cloud],
+    samples: Mapping[str, SurfaceSamples],
+    reference: str,
+    starts: Starts | None,
+    report: Progress,
+) -> tuple[MultiwayAlignment, dict[str, np.ndarray]]:
+    """Register the scans without what agrees without motion, or as they are where that does not separate two motions.
+
+    Returns the alignment and the static points, (h, w) bool by scan.
+    """
+    # markers tell how the object moved, also where a plane in its own plane seems to stand still
+    is_marked = starts is not None and starts.markers
+    unmoved = _no_points(clouds) if is_marked else _detect_unmoved_points(clouds, samples)
+    if _has_points(unmoved):
+        first = _try_register(remove_points(clouds, unmoved), reference, starts, lambda share: report(0.5 * share))
+        if first is not None:
+            static = detect_static_points(clouds, samples, first)
+            if _has_points(static):
+                return first, static
+    alignment = register_all(clouds, reference, starts, lambda share: report(0.5 + 0.2 * share))
+    return alignment, detect_static_points(clouds, samples, alignment)
+
+
+def _has_points(static: Mapping[str, np.ndarray]) -> bool:
+    """Whether any pixel of a scan is static, by (h, w) bool of each."""
+    return any(mask.any() for mask in static.values())
+
+
+def _no_points(clouds: Mapping[str, Cloud]) -> dict[str, np.ndarray]:
+    """Return (h, w) bool by scan, all False."""
+    return {name: np.zeros_like(cloud.mask) for name, cloud in clouds.items()}
+
+
+def _sample_clouds(clouds: Mapping[str, Cloud]) -> dict[str, SurfaceSamples]:
+    """Return the samples of the precise points of each scan."""
+    return {name: sample_surface(_select_precise(cloud)) for name, cloud in clouds.items()}
 
 
 def _select_precise(cloud: Cloud) -> np.ndarray:
@@ -162,7 +188,7 @@ def remove_points(clouds: Mapping[str, Cloud], static: Mapping[str, np.ndarray])
 
 def _try_register(
     clouds: Mapping[str, Cloud], reference: str, starts: Starts | None, progress: Progress
-) -> Alignment | None:
+) -> MultiwayAlignment | None:
     """Return ``register_all`` of the clouds, or None where it refuses."""
     try:
         return register_all(clouds, reference, starts, progress)
@@ -187,7 +213,7 @@ def _detect_unmoved_points(clouds: Mapping[str, Cloud], samples: Mapping[str, Su
     for name, cloud in clouds.items():
         measured, unmoved = int(cloud.mask.sum()), int(static[name].sum())
         if unmoved < LEAST_PART * measured or measured - unmoved < 2 * LEAST_POINTS:
-            return {name: np.zeros_like(mask) for name, mask in static.items()}
+            return _no_points(clouds)
     return static
 
 
@@ -195,14 +221,13 @@ def sample_surface(points: np.ndarray) -> SurfaceSamples:
     """Downsample the measured points (n, 3) mm of a scan in its camera's frame; grazing samples are removed."""
     o3d = open3d()
     points = np.asarray(points, np.float64)
-    low, high = np.percentile(points[:: max(1, len(points) // 100_000)], (1.0, 99.0), axis=0)
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
-    cloud = cloud.voxel_down_sample(float((high - low).max()) / _SAMPLES_PER_SIDE)
+    cloud = cloud.voxel_down_sample(measure_size(points) / _SAMPLES_PER_SIDE)
     cloud = sort_spatially(cloud)
     cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(_NORMAL_POINTS))
     cloud.orient_normals_towards_camera_location(np.zeros(3))
     samples, normals = np.asarray(cloud.points), np.asarray(cloud.normals)
-    facing = -np.sum(samples * normals, axis=1) > _MIN_COSINE * np.linalg.norm(samples, axis=1)
+    facing = -np.sum(samples * normals, axis=1) > _MIN_COSINE * lengths(samples)
     facing &= samples[:, 2] > 0
     samples, normals = samples[facing], normals[facing]
     ray_tree, point_tree = cKDTree(samples[:, :2] / samples[:, 2:]), cKDTree(samples)
@@ -266,7 +291,7 @@ def estimate_gate(height: np.ndarray, widest_mm: float) -> float:
 
 
 def detect_static_points(
-    clouds: Mapping[str, Cloud], samples: Mapping[str, SurfaceSamples], alignment: Alignment
+    clouds: Mapping[str, Cloud], samples: Mapping[str, SurfaceSamples], alignment: MultiwayAlignment
 ) -> dict[str, np.ndarray]:
     """Detect the points, (h, w) bool by scan, that are static in the camera's frame while the object moves.
 

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from slviewer.errors import InputError
 from slviewer.geometry.rigid import turn_about
+from slviewer.geometry.vectors import lengths, unit_vectors
 
 _MAX_ANGLE_ERROR_DEG = 3.0
 """Largest difference between a measured and a given step of the turntable."""
@@ -26,8 +27,7 @@ class TurntableAxis:
 
     def rotation(self, deg: float) -> np.ndarray:
         """Return the motion (4, 4) of an object on the table when the table turns by an angle."""
-        unit = np.asarray(self.direction, dtype=np.float64) / np.linalg.norm(self.direction)
-        return turn_about(np.radians(deg) * unit, self.point)
+        return turn_about(np.radians(deg) * unit_vectors(self.direction), self.point)
 
 
 def shortest_turn(deg: float) -> float:
@@ -54,7 +54,7 @@ def fit_turntable_axis(steps: Sequence[np.ndarray], step_deg: ArrayLike) -> Turn
         )
     # registration turns the later scan back by the table's step
     turns = np.array([-np.degrees(Rotation.from_matrix(T[:3, :3]).as_rotvec()) for T in steps])
-    angles = np.linalg.norm(turns, axis=1)
+    angles = lengths(turns)
     for angle, deg in zip(angles, np.abs(given), strict=True):
         if abs(angle - deg) > _MAX_ANGLE_ERROR_DEG:
             raise InputError(
@@ -65,4 +65,4 @@ def fit_turntable_axis(steps: Sequence[np.ndarray], step_deg: ArrayLike) -> Turn
     A = np.vstack([np.eye(3) - T[:3, :3] for T in steps])
     b = np.concatenate([T[:3, 3] for T in steps])
     # the position along the axis is free: the minimum-norm solution is the point nearest to the camera
-    return TurntableAxis(np.linalg.lstsq(A, b, rcond=1e-3)[0], direction / np.linalg.norm(direction))
+    return TurntableAxis(np.linalg.lstsq(A, b, rcond=1e-3)[0], unit_vectors(direction))

@@ -26,7 +26,7 @@ from slviewer.pipeline.simulate import TARGET, turn_plan
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.reconstruction.reconstruct import Model, reconstruct
 from slviewer.registration.markers import measure_markers
-from slviewer.registration.multiway import Alignment, Starts, register_all
+from slviewer.registration.multiway import MultiwayAlignment, Starts, register_all
 from slviewer.registration.pairwise import Registration
 from slviewer.registration.refusal import Refused
 from slviewer.simulation.boards import Pose, blank_board
@@ -65,7 +65,7 @@ class RegisteredScans:
     camera's frame, and the seconds that registering took."""
 
     clouds: Mapping[str, Cloud]
-    alignment: Alignment
+    alignment: MultiwayAlignment
     poses: Mapping[str, np.ndarray]
     seconds: float
 

@@ -11,8 +11,8 @@ from slviewer.calibration.splined.uncertainty import volume_sigmas
 from slviewer.calibration.splined.unknowns import Arrangement
 from slviewer.calibration.splined.volume import (
     Volume,
-    depth_axis,
     remove_rigid_motion,
+    select_depth_axis,
     sigma_3d,
     view_pixels,
     working_volume,
@@ -115,7 +115,7 @@ def compare_with_truth(model: SplinedModel, true: SimulatedRig) -> PredictedErro
     bundle, rig = model.bundle, model.rig
     columns, rows, depths = GRID
     volume = working_volume(rig, bundle.depth_range_mm, columns=columns, rows=rows, depths=depths)
-    axis = depth_axis(rig, volume)
+    axis = select_depth_axis(rig, volume)
     errors = true_errors(true, rig, volume, axis)
     known = np.isfinite(errors).all(axis=1)
     volume = Volume(*(each[known] for each in (volume.pixels, volume.z, volume.points, volume.projector)))

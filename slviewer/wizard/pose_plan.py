@@ -17,7 +17,7 @@ from slviewer.calibration.next_pose import (
     Coverage,
     Suggestion,
     approximate_pose,
-    coverage,
+    count_coverage,
     depth_range,
     describe_suggestion,
     estimated_lens,
@@ -174,7 +174,7 @@ def _plan_by_coverage(given: PlanInput, lens: Lens, known: Mapping[str, np.ndarr
             poses[name] = T
     placed = list(poses.values())
     usual_mm = USUAL_SIGMA * float(np.mean(depth_range(given.board, lens)))
-    by_coverage = PosePlan(lens, poses, coverage(given.board, lens, placed), None, usual_mm)
+    by_coverage = PosePlan(lens, poses, count_coverage(given.board, lens, placed), None, usual_mm)
     if not suggests:
         return by_coverage
     reached = None

@@ -7,7 +7,7 @@ from facts import missing_facts, raises
 from slviewer.calibration.next_pose import (
     TILTS,
     approximate_pose,
-    coverage,
+    count_coverage,
     depth_range,
     estimated_lens,
     nominal_lens,
@@ -36,7 +36,7 @@ def follow(n: int, illuminated=everywhere) -> list[np.ndarray]:
 @pytest.mark.computes
 def test_suggestions_close_every_gap_and_stay_in_view():
     poses = follow(12)
-    found = coverage(BOARD, LENS, poses)
+    found = count_coverage(BOARD, LENS, poses)
     assert found.cells.min() >= 2 and found.depths.min() >= 2 and found.tilts.min() >= 1
     assert found.share > 0.95
     near, far = depth_range(BOARD, LENS)
@@ -44,7 +44,7 @@ def test_suggestions_close_every_gap_and_stay_in_view():
         corners = outline_px(BOARD, LENS, T)
         assert (corners > 0).all() and (corners < [399, 299]).all()
         assert near * 0.8 < T[2, 3] < far * 1.2
-    shares = [coverage(BOARD, LENS, poses[:k]).share for k in range(13)]
+    shares = [count_coverage(BOARD, LENS, poses[:k]).share for k in range(13)]
     assert shares[0] == 0 and np.diff(shares).min() >= 0
 
 
@@ -56,7 +56,7 @@ def test_words_say_what_the_pose_is():
     for _ in range(14):
         next_one = suggest(BOARD, LENS, poses, illuminated=everywhere)
         poses.append(next_one.T_camera_board)
-        tilts = coverage(BOARD, LENS, poses[-1:]).tilts
+        tilts = count_coverage(BOARD, LENS, poses[-1:]).tilts
         tilt = TILTS[int(np.argmax(tilts))]
         attitude, _, where = next_one.sentence.split(",")
         assert missing_facts(attitude, *words[tilt]) == []
@@ -65,7 +65,7 @@ def test_words_say_what_the_pose_is():
         assert ("left" in where) == (centre[0] < 0.44 * 400)
     assert seen == set(TILTS)
     # the top of a board tilted "top away" is farther than its bottom
-    top_away = next(T for T in poses if coverage(BOARD, LENS, [T]).tilts[1])
+    top_away = next(T for T in poses if count_coverage(BOARD, LENS, [T]).tilts[1])
     top, bottom = (top_away[:3, :3] @ corner + top_away[:3, 3] for corner in BOARD.outline()[[0, 3]])
     assert top[2] > bottom[2] + 10
 

@@ -15,8 +15,8 @@ from slviewer.calibration.splined.uncertainty import (
 )
 from slviewer.calibration.splined.volume import (
     BestMotion,
-    depth_axis,
     remove_rigid_motion,
+    select_depth_axis,
     select_visible,
     sigma_3d,
     working_volume,
@@ -61,7 +61,7 @@ def test_the_working_volume_is_what_both_see_in_front_of_inside_and_behind_the_c
     assert volume.z.min() < 0.9 * near and volume.z.max() > 1.1 * far
     assert {0.0, width - 1} <= set(volume.pixels[:, 0]) and {0.0, height - 1} <= set(volume.pixels[:, 1])
     assert (volume.projector > -0.51).all() and (volume.projector < model.rig.projector.size).all()
-    assert depth_axis(model.rig, volume) == "x"
+    assert select_depth_axis(model.rig, volume) == "x"
     supported = volume.supported(model.rig, *illuminated(model))
     assert 0.5 < supported.mean() <= 1
     with pytest.raises(InputError):

@@ -14,7 +14,7 @@ from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import InputError
 from slviewer.evaluation.acceptance.artefact import Artefact, Limits
 from slviewer.evaluation.acceptance.figures import AcceptanceFigure, decide, narrowest_range
-from slviewer.evaluation.acceptance.measure import FLATNESS, FORM, SIZE, SPACING, measure
+from slviewer.evaluation.acceptance.measure import FLATNESS, FORM, SIZE, SPACING, measure_artefact
 from slviewer.evaluation.acceptance.result import CLAIM, conclude_test
 from slviewer.evaluation.budget import Contribution, ErrorBudget
 from slviewer.evaluation.repeatability import repeatability
@@ -78,7 +78,7 @@ def bars():
 
 def outcome(artefact, bars, model):
     return conclude_test(
-        artefact, "stereo", [measure(artefact, reconstruct(model, p), words, words, R2) for words, p in bars]
+        artefact, "stereo", [measure_artefact(artefact, reconstruct(model, p), words, words, R2) for words, p in bars]
     )
 
 
@@ -149,7 +149,7 @@ def test_planes_are_flat_to_their_noise(count):
         T = place.T_camera_artefact
         plate = blank_board(Pose(T[:3, :3], T[:3, 3]), (140.0, 110.0))
         cloud = reconstruct(true_model(), phases_of(plate, 50 + i))
-        found.append(measure(artefact, cloud, place.words, "plane", R2))
+        found.append(measure_artefact(artefact, cloud, place.words, "plane", R2))
     test = conclude_test(artefact, "stereo", found)
     for position in found:
         assert position.rms_mm[0] == pytest.approx(position.floor_mm[0], rel=0.08)

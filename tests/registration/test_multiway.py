@@ -11,7 +11,7 @@ from slviewer.reconstruction.cloud import Cloud
 from slviewer.registration import graph
 from slviewer.registration.consistency import select_consistent_edges
 from slviewer.registration.graph import Edge
-from slviewer.registration.multiway import Alignment, Scan, Starts, register_all
+from slviewer.registration.multiway import MultiwayAlignment, Scan, Starts, register_all
 from slviewer.registration.refusal import Refused
 from slviewer.registration.turntable import TurntableAxis, fit_turntable_axis
 
@@ -128,13 +128,13 @@ def turned_scans(count: int, step: float) -> dict[str, Scan]:
 
 
 @pytest.fixture(scope="module")
-def turn() -> Alignment:
+def turn() -> MultiwayAlignment:
     scans = turned_scans(6, 60.0)
     return register_all(scans, "turn_03", Starts(table_deg=dict(zip(scans, 60.0 * np.arange(6), strict=True))))
 
 
 @pytest.mark.slow
-def test_a_turn_closes(turn: Alignment) -> None:
+def test_a_turn_closes(turn: MultiwayAlignment) -> None:
     for k, T in enumerate(turn.T_reference_scan.values()):
         shift, deg = off(T, TABLE.rotation(60.0 * (2 - k)))
         assert shift < 0.03 and deg < 0.06

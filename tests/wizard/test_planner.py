@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from wizard_events import HANG_S
 
-from slviewer.calibration.next_pose import coverage, describe_suggestion, nominal_lens
+from slviewer.calibration.next_pose import count_coverage, describe_suggestion, nominal_lens
 from slviewer.calibration.stereo import StereoModel
 from slviewer.geometry.rig import StereoRig
 from slviewer.target.board import Board
@@ -24,7 +24,13 @@ def plan_of(poses: tuple[str, ...], sigma: float | None = None, depth: float = 6
     T[2, 3] = depth
     placed = dict.fromkeys(poses, T)
     return PosePlan(
-        lens, placed, coverage(BOARD, lens, [T] * len(poses)), describe_suggestion(BOARD, lens, T), 0.03, sigma, sigma
+        lens,
+        placed,
+        count_coverage(BOARD, lens, [T] * len(poses)),
+        describe_suggestion(BOARD, lens, T),
+        0.03,
+        sigma,
+        sigma,
     )
 
 

@@ -12,11 +12,15 @@ from slviewer.calibration.diagnosis.poses import (
     ORDERS,
     classify_frame_order,
     format_poses,
+    list_ordered_poses,
     rate_severity,
     was_refused,
 )
 from slviewer.calibration.diagnosis.verdict import CAUSES, Cause, Finding, Severity
+from slviewer.calibration.observe import AXES
+from slviewer.fringe.sequence import Axis
 from slviewer.geometry.robust import robust_sigma
+from slviewer.geometry.vectors import unit_vectors
 
 MAX_SATURATED = 0.12
 REJECTED_SATURATED = 0.3
@@ -80,13 +84,11 @@ def diagnose_saturation(e: Evidence) -> Iterator[Finding]:
 
 def diagnose_mirroring(e: Evidence) -> Iterator[Finding]:
     """Yield a finding where the axes are exchanged or one is reversed: the projector's image is a mirror image."""
-    jacobians = {
-        pose.name: np.array(pose.turn) for pose in e.poses if pose.turn is not None and not classify_frame_order(pose)
-    }
+    jacobians = {pose.name: np.array(pose.turn) for pose in list_ordered_poses(e) if pose.turn is not None}
     mirrored = {name: J for name, J in jacobians.items() if np.linalg.det(J) < 0}
     if len(mirrored) <= COMMON_SHARE * len(jacobians):
         return
-    mean = np.mean([J / np.linalg.norm(J, axis=1, keepdims=True) for J in mirrored.values()], axis=0)
+    mean = np.mean([unit_vectors(J) for J in mirrored.values()], axis=0)
     names = tuple(mirrored)
     observation = (
         f"in {len(mirrored)} of {len(jacobians)} poses the projector's coordinates are a mirror image of what the "
@@ -128,31 +130,15 @@ def diagnose_period(e: Evidence) -> Iterator[Finding]:
         sentence, _, remedy = e.contradiction.partition(": ")
         yield Finding("fringe-period", "rejected", sentence, remedy or "correct the sequence's description")
         return
-    if any(diagnose_mirroring(e)):  # the code is of another axis, or from its other end
+    # the code is of another axis or from its other end, or gamma moves the phase at which it starts
+    if any(diagnose_mirroring(e)) or _list_aliased_gamma_poses(e):
         return
-    if _list_aliased_gamma_poses(e):  # gamma moves the phase at which the code starts
-        return
-    ordered = [pose for pose in e.poses if not classify_frame_order(pose)]
-    wrong = {}
-    for axis in ("x", "y"):
-        periods = np.array([p.axes[axis].period_seen_px for p in ordered if axis in p.axes])
-        periods = periods[np.isfinite(periods)]
-        if len(periods) < 3:
-            continue
-        described = float(np.median([p.axes[axis].period_px for p in ordered if axis in p.axes]))
-        measured = float(np.median(periods))
-        sigma = 1.2533 * robust_sigma(periods) / np.sqrt(len(periods))  # of a median
-        if (
-            abs(measured / described - 1) > MAX_PERIOD_ERROR
-            and abs(measured - described) > PERIOD_SIGMAS * sigma
-            and CODE_ORIGIN_PX * abs(described / measured - 1) > RIPPLE_PEAK * max_ripple_px(e)
-        ):
-            wrong[axis] = f"{axis}: {measured:.1f} px measured, {described:g} px described"
+    wrong = [text for axis in AXES if (text := _describe_wrong_period(e, axis))]
     if wrong:
         yield Finding(
             "fringe-period",
             "rejected",
-            f"the fringe period differs from the sequence's description ({' and '.join(wrong.values())}), by the phase "
+            f"the fringe period differs from the sequence's description ({' and '.join(wrong)}), by the phase "
             "at the Gray code's edges",
             "correct period_px in the description, or project the patterns without scaling",
         )
@@ -167,11 +153,25 @@ def diagnose_period(e: Evidence) -> Iterator[Finding]:
             )
 
 
+def _describe_wrong_period(e: Evidence, axis: Axis) -> str:
+    """Describe how the period of an axis differs from its description; "" where it does not, or is not measured."""
+    axes = [pose.axes[axis] for pose in list_ordered_poses(e) if axis in pose.axes]
+    periods = np.array([a.period_seen_px for a in axes if np.isfinite(a.period_seen_px)])
+    if len(periods) < 3:
+        return ""
+    described, measured = float(np.median([a.period_px for a in axes])), float(np.median(periods))
+    sigma = 1.2533 * robust_sigma(periods) / np.sqrt(len(periods))  # of a median
+    is_wrong = (
+        abs(measured / described - 1) > MAX_PERIOD_ERROR
+        and abs(measured - described) > PERIOD_SIGMAS * sigma
+        and CODE_ORIGIN_PX * abs(described / measured - 1) > RIPPLE_PEAK * max_ripple_px(e)
+    )
+    return f"{axis}: {measured:.1f} px measured, {described:g} px described" if is_wrong else ""
+
+
 def diagnose_description(e: Evidence) -> Iterator[Finding]:
     """Yield the contradictions between frames and description that no other rule explains."""
-    first = {
-        pose.name: pose.contradictions[0] for pose in e.poses if pose.contradictions and not classify_frame_order(pose)
-    }
+    first = {pose.name: pose.contradictions[0] for pose in list_ordered_poses(e) if pose.contradictions}
     for cause in dict.fromkeys(contradiction.cause for contradiction in first.values()):
         if cause not in CAUSES or cause in _CAUSES_IN_POSES:
             continue
@@ -263,8 +263,7 @@ def diagnose_gamma(e: Evidence) -> Iterator[Finding]:
             names,
         )
         return
-    ordered = [pose for pose in e.poses if not classify_frame_order(pose)]
-    ratios = [a.harmonic for p in ordered for a in p.axes.values() if np.isfinite(a.harmonic)]
+    ratios = [a.harmonic for p in list_ordered_poses(e) for a in p.axes.values() if np.isfinite(a.harmonic)]
     if not ratios:
         return
     exponent = gamma_from_harmonic(float(np.median(ratios)))

@@ -11,6 +11,8 @@ from slviewer.fringe.phase import PhaseMap, Reason
 from slviewer.fringe.reference import bit_heights, dark_limit, dark_sigmas, phase_shift
 from slviewer.fringe.residual_sample import FEWEST, select_rows
 from slviewer.fringe.sequence import Axis, PatternSequence
+from slviewer.geometry.polynomial import fit_slopes
+from slviewer.geometry.vectors import finite_rows, lengths
 
 ORIGIN_ROWS = 150
 """Image lines along which the Gray code's edges are located."""
@@ -173,7 +175,7 @@ def measure_motion_px(sequence: PatternSequence, stack: np.ndarray, pixels: np.n
         first, second, points, points.copy(), winSize=(window, window), maxLevel=levels
     )
     shift = (tracked - points).reshape(-1, 2)[np.asarray(status).ravel() > 0]
-    return float(np.median(np.linalg.norm(shift, axis=1))) if len(shift) >= 4 else np.nan
+    return float(np.median(lengths(shift))) if len(shift) >= 4 else np.nan
 
 
 def _scene_image(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -> np.ndarray | None:
@@ -200,9 +202,8 @@ def fit_mean_turn(camera: np.ndarray, projector: np.ndarray) -> tuple[tuple[floa
 
     Rows with NaN do not count; None for fewer than four others.
     """
-    known = np.isfinite(camera).all(1) & np.isfinite(projector).all(1)
+    known = finite_rows(camera, projector)
     if np.count_nonzero(known) < 4:
         return None
-    design = np.column_stack([camera[known], np.ones(np.count_nonzero(known))])
-    (a, b), (c, d) = np.linalg.lstsq(design, projector[known], rcond=None)[0][:2].T
+    (a, b), (c, d) = fit_slopes(camera, projector).T
     return (float(a), float(b)), (float(c), float(d))

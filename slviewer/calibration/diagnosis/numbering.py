@@ -9,6 +9,7 @@ import numpy as np
 from slviewer.calibration.observe import Observation
 from slviewer.calibration.splined.half_turns import opposite_features
 from slviewer.geometry.polynomial import monomials, scale_to_unit_square
+from slviewer.geometry.vectors import lengths
 from slviewer.target.blobs import detect_blobs
 from slviewer.target.board import Board
 from slviewer.target.images import SEARCH_PX, BoardImage, resize_image
@@ -126,12 +127,12 @@ def _measure_misfit(points: np.ndarray, pixels: np.ndarray, pitch_mm: float) -> 
         offset = np.nan_to_num((pixels - to_image(H, board)) / max(scale, 1e-6), nan=1e6, posinf=1e6, neginf=-1e6)
     terms = monomials(scale_to_unit_square(board), 3)
     inlier = np.asarray(inliers).ravel() > 0
-    residual = np.linalg.norm(offset, axis=1)
+    residual = lengths(offset)
     for _ in range(3):
         if np.count_nonzero(inlier) < 2 * terms.shape[1]:
-            residual = np.linalg.norm(offset, axis=1)
+            residual = lengths(offset)
             break
         distortion = terms @ np.linalg.lstsq(terms[inlier], offset[inlier], rcond=None)[0]
-        residual = np.linalg.norm(offset - distortion, axis=1)
+        residual = lengths(offset - distortion)
         inlier = residual < max(_INLIER_PITCHES, 3 * float(np.median(residual[inlier])))
     return float(np.sort(residual)[-max(1, len(residual) // 100)]), bool(np.linalg.det(H) < 0)

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from slviewer.calibration.diagnosis.evidence import Evidence, PoseEvidence
+from slviewer.calibration.diagnosis.evidence import Evidence, ExcludedPose, PoseEvidence
 from slviewer.calibration.diagnosis.verdict import Cause, Finding, Severity
 from slviewer.fringe.suspect import LIGHT_FAULTS
 
@@ -62,41 +62,49 @@ def classify_frame_order(pose: PoseEvidence) -> Cause | None:
     return "frame-order" if faults["late"] + faults["early"] + faults["swapped"] else None
 
 
+def list_ordered_poses(e: Evidence) -> list[PoseEvidence]:
+    """List the poses whose frames are in order."""
+    return [pose for pose in e.poses if not classify_frame_order(pose)]
+
+
 def diagnose_single_poses(e: Evidence) -> Iterator[Finding]:
     """Yield a finding each for the poses that are misnumbered, that moved, and that disagree with the others."""
     sentences: dict[Cause, dict[str, str]] = {"board-numbering": {}, "moved": {}, "outlier": {}}
     limit_px = motion_limit_px(e.poses)
-    for pose in e.poses:
-        if classify_frame_order(pose):
-            continue
+    for pose in list_ordered_poses(e):
         if pose.numbering:
             sentences["board-numbering"][pose.name] = f"in {pose.name} the board's features are {pose.numbering}"
         elif pose.moved_px > limit_px:
             sentences["moved"][pose.name] = (
                 f"{pose.name}: the board moved by {pose.moved_px:.2f} px while it was captured"
             )
-    for name, pose_residuals in e.solution.excluded.items() if e.solution else ():
-        if name in e.excluded or any(name in poses for poses in sentences.values()):
-            continue
-        assert e.solution is not None
-        camera_limit, projector_limit = (_RESIDUAL_RATIO * max(px, 0.02) for px in e.solution.median_pose_rms_px)
-        camera_px, projector_px = min(pose_residuals.camera_px, 999), min(pose_residuals.projector_px, 999)
-        if camera_px < camera_limit and projector_px > projector_limit:
-            sentences["moved"][name] = (
-                f"{name}: the projector's coordinates are {projector_px:.1f} px off the board that the camera sees: it "
-                "moved while it was captured"
-            )
-        else:
-            sentences["outlier"][name] = (
-                f"{name} disagrees with the other poses by {camera_px:.1f} px in the camera and {projector_px:.1f} px "
-                "in the projector"
-            )
+    if e.solution is not None:
+        explained = {*e.excluded, *sentences["board-numbering"], *sentences["moved"]}
+        for name, residuals in e.solution.excluded.items():
+            if name not in explained:
+                cause, sentence = _explain_residuals(name, residuals, e.solution.median_pose_rms_px)
+                sentences[cause][name] = sentence
     for cause, poses in sentences.items():
         if poses:
             names = tuple(poses)
             sentence = "; ".join(list(poses.values())[:3]) + (f"; and {len(poses) - 3} more" if len(poses) > 3 else "")
             severity = rate_severity(e, names, is_excluded=e.solution is not None)
             yield Finding(cause, severity, f"{sentence}; excluded", _REMEDIES[cause], names)
+
+
+def _explain_residuals(name: str, residuals: ExcludedPose, median_px: tuple[float, float]) -> tuple[Cause, str]:
+    """Return the cause of an excluded pose's residuals, given the poses' median residuals, and a sentence on them."""
+    camera_limit, projector_limit = (_RESIDUAL_RATIO * max(px, 0.02) for px in median_px)
+    camera_px, projector_px = min(residuals.camera_px, 999), min(residuals.projector_px, 999)
+    if camera_px < camera_limit and projector_px > projector_limit:
+        return "moved", (
+            f"{name}: the projector's coordinates are {projector_px:.1f} px off the board that the camera sees: it "
+            "moved while it was captured"
+        )
+    return "outlier", (
+        f"{name} disagrees with the other poses by {camera_px:.1f} px in the camera and {projector_px:.1f} px in the "
+        "projector"
+    )
 
 
 _REMEDIES: dict[Cause, str] = {

@@ -13,8 +13,9 @@ import numpy as np
 from slviewer.calibration.observe import AXES, Observation, Samples
 from slviewer.calibration.stereo import StereoModel
 from slviewer.fringe.sequence import Axis
-from slviewer.geometry.polynomial import fit_polynomial
+from slviewer.geometry.polynomial import fit_polynomial, fit_slopes
 from slviewer.geometry.robust import robust_sigma
+from slviewer.geometry.vectors import finite_rows
 
 MAX_WAVES = 8
 """Largest number of waves per fringe period that is fitted."""
@@ -82,7 +83,7 @@ def _intersect_board(samples: Samples, stereo: StereoModel, pose: str) -> np.nda
     T = stereo.poses[pose]
     rays = np.column_stack([stereo.rig.camera.undistort(samples.camera), np.ones(len(samples.camera))])
     with np.errstate(invalid="ignore", divide="ignore"):
-        return np.asarray(rays * ((T[:3, 2] @ T[:3, 3]) / (rays @ T[:3, 2]))[:, None])
+        return rays * ((T[:3, 2] @ T[:3, 3]) / (rays @ T[:3, 2]))[:, None]
 
 
 def _measure_depths(points: np.ndarray, stereo: StereoModel) -> np.ndarray:
@@ -118,13 +119,11 @@ def _measure_blocks(camera: np.ndarray, periods: np.ndarray) -> np.ndarray:
 
     ``camera`` (n, 2) px: centres of a pose's blocks; ``periods`` (n,): their projector coordinates in fringe periods.
     """
-    known = np.isfinite(periods)
-    design = np.column_stack([camera[known], np.ones(np.count_nonzero(known))])
-    slopes = np.linalg.lstsq(design, periods[known], rcond=None)[0][:2]
+    slopes = np.abs(fit_slopes(camera, periods[:, None]))
     columns, counts = np.unique(np.round(2 * camera[:, 0]) / 2, return_counts=True)
     columns = columns[counts > 0.1 * counts.max()]  # whole blocks
     side = float(np.median(np.diff(columns))) if len(columns) > 1 else 1.0
-    return np.array([abs(slopes[0]), abs(slopes[1]), max(1.0, round(side))])
+    return np.array([*slopes[:, 0], max(1.0, round(side))])
 
 
 def _fit_ripple(samples: np.ndarray, mm_per_px: float, depth_mm: float) -> Ripple | None:
@@ -133,7 +132,7 @@ def _fit_ripple(samples: np.ndarray, mm_per_px: float, depth_mm: float) -> Rippl
     ``samples`` (n, 6): projector coordinate in periods, residual px, predicted noise px, and the three numbers of
     ``_measure_blocks``, by which the mean over a block attenuates each wave. Rows with NaN do not count.
     """
-    samples = samples[np.isfinite(samples).all(axis=1)]
+    samples = samples[finite_rows(samples)]
     if len(samples) < MIN_SAMPLES:
         return None
     periods, residual, sigma = samples.T[:3]

@@ -2,14 +2,16 @@
 
 from collections.abc import Sequence
 
-import cv2
 import numpy as np
 
+from slviewer.calibration.board_pose import solve_pose
 from slviewer.calibration.diagnosis.evidence import ExcludedPose, SolutionEvidence
 from slviewer.calibration.diagnosis.ripple import measure_ripple
 from slviewer.calibration.observe import Observation
 from slviewer.calibration.stereo import StereoModel
-from slviewer.geometry.rigid import move_points, transform_from_rvec
+from slviewer.geometry.polynomial import grid_points
+from slviewer.geometry.rigid import largest_angle_deg, move_points
+from slviewer.geometry.vectors import finite_rows
 
 CORNERS = {"top left": (0, 0), "top right": (1, 0), "bottom left": (0, 1), "bottom right": (1, 1)}
 CORNER_SHARE = (1 / 4, 1 / 3)
@@ -26,7 +28,6 @@ def measure_solution(observations: Sequence[Observation], stereo: StereoModel) -
     used = [o for o in observations if o.name in stereo.poses]
     K = stereo.rig.projector.K
     normals = np.array([T[:3, 2] * np.sign(T[2, 2] or 1) for T in stereo.poses.values()])
-    cosines = np.clip(normals @ normals.T, -1, 1)
     camera, projector = np.array([stereo.pose_rms_px[o.name] for o in used]).T
     return SolutionEvidence(
         used=tuple(stereo.poses),
@@ -37,7 +38,7 @@ def measure_solution(observations: Sequence[Observation], stereo: StereoModel) -
             "camera": stereo.focal_sigma_px["camera"] / float(min(np.diag(stereo.rig.camera.K)[:2])),
             "projector": stereo.focal_sigma_px["projector"] / float(min(np.diag(K)[:2])),
         },
-        tilt_spread_deg=float(np.degrees(np.arccos(cosines.min()))),
+        tilt_spread_deg=largest_angle_deg(normals),
         empty_corners=list_empty_corners(used, stereo),
         aspect=float(K[1, 1] / K[0, 0]),
         ripple=measure_ripple(used, stereo),
@@ -47,15 +48,13 @@ def measure_solution(observations: Sequence[Observation], stereo: StereoModel) -
 def measure_excluded(observation: Observation, stereo: StereoModel) -> ExcludedPose:
     """Measure the residuals of an excluded pose under the calibration; inf where its pose cannot be solved."""
     camera = stereo.rig.camera
-    detected = np.isfinite(observation.camera).all(1)
-    if np.count_nonzero(detected) < 6:
+    detected = finite_rows(observation.camera)
+    T = None
+    if np.count_nonzero(detected) >= 6:
+        T = solve_pose(observation.points[detected], observation.camera[detected], camera.K, camera.D)
+    if T is None:
         return ExcludedPose(np.inf, np.inf)
-    success, rvec, tvec = cv2.solvePnP(
-        observation.points[detected], observation.camera[detected], camera.K, camera.D, flags=cv2.SOLVEPNP_ITERATIVE
-    )
-    if not success:
-        return ExcludedPose(np.inf, np.inf)
-    X = move_points(transform_from_rvec(rvec, tvec), observation.points)
+    X = move_points(T, observation.points)
     residuals = camera.project(X) - observation.camera, stereo.rig.project(X) - observation.projector
     return ExcludedPose(*map(_trimmed_rms, residuals))
 
@@ -71,7 +70,7 @@ def list_empty_corners(observations: Sequence[Observation], stereo: StereoModel)
             (np.arange(_GRID) + 0.5) / _GRID * share * size + side * (1 - share) * size
             for share, size, side in zip(CORNER_SHARE, (width, height), (right, bottom), strict=True)
         ]
-        pixels = np.stack(np.meshgrid(*along), axis=-1).reshape(-1, 2)
+        pixels = grid_points(*along)
         illuminated = _is_illuminated(pixels, stereo)
         if illuminated.mean() < ILLUMINATED_SHARE:
             continue
@@ -87,13 +86,11 @@ def _is_illuminated(pixels: np.ndarray, stereo: StereoModel) -> np.ndarray:
     """(n,) bool: camera pixels (n, 2) on whose rays the projector illuminates two of three of the boards' depths."""
     near, far = stereo.depth_range_mm or (0.0, 0.0)
     rays = stereo.rig.camera.undistort(pixels)
-    size = np.array(stereo.rig.projector.size)
     inside = []
     for z in (near, (near + far) / 2, far):
         projected = stereo.rig.project(np.column_stack([rays * z, np.full(len(rays), z)]))
-        with np.errstate(invalid="ignore"):
-            inside.append(((projected > -0.5) & (projected < size - 0.5)).all(1))
-    return np.asarray(np.sum(inside, axis=0) >= 2)
+        inside.append(stereo.rig.projector.contains(projected))
+    return np.sum(inside, axis=0) >= 2
 
 
 def _is_covered(observation: Observation, pixels: np.ndarray) -> np.ndarray:

@@ -17,6 +17,7 @@ from slviewer.calibration.drift.reference import DriftReference, PoseChange
 from slviewer.calibration.drift.view import DriftView
 from slviewer.errors import InputError
 from slviewer.fringe.sequence import Axis
+from slviewer.geometry.vectors import rms, unit_vectors
 
 FALSE_ALARMS = 1e-4
 """False-alarm probability of one check; a check precedes every day's work."""
@@ -109,10 +110,10 @@ def check_drift(reference: DriftReference, view: DriftView) -> Drift:
     degrees = 6 * len(own) - 3  # the floor is itself an estimate, from so many numbers
     chance = float(fdtrc(6, degrees, squared_distance / 6))
     limit = 6 * float(fdtri(6, degrees, 1 - FALSE_ALARMS))
-    scale_sigma = float(np.hypot(np.sqrt(np.mean([a.scale**2 for a in own])), growth))
+    scale_sigma = float(np.hypot(rms([a.scale for a in own]), growth))
     two = np.isfinite(estimate.across_px)
     across_sigma = float(np.sqrt(np.nanmean([a.across_px**2 for a in own]))) if two else None
-    along = np.concatenate([np.zeros(3), reference.rig.t / np.linalg.norm(reference.rig.t)])
+    along = np.concatenate([np.zeros(3), unit_vectors(reference.rig.t)])
     reasons = []
     worst = max(a.misfit_px for a in own)
     if estimate.misfit_px > MAX_MISFIT_RATIO * worst:

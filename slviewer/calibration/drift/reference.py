@@ -18,7 +18,9 @@ from scipy.optimize import minimize
 from slviewer.calibration.drift.view import KINDS, DisplacementField, DriftView, LinearView, linearise_view
 from slviewer.errors import InputError
 from slviewer.geometry.rig import StereoRig
+from slviewer.geometry.rigid import Floats
 from slviewer.geometry.robust import robust_sigma, tukey_weights
+from slviewer.geometry.vectors import rms
 
 MIN_POSES = 8
 """With fewer poses, the fields estimated without one pose do not represent those of a later view."""
@@ -42,14 +44,14 @@ class PoseChange:
     """
 
     name: str
-    change: NDArray[np.float64]
-    spreads: Mapping[str, NDArray[np.float64]]
-    by_growth: NDArray[np.float64]
+    change: Floats
+    spreads: Mapping[str, Floats]
+    by_growth: Floats
     scale: float
     across_px: float
     misfit_px: float
 
-    def covariance(self, sigmas: Mapping[str, float]) -> NDArray[np.float64]:
+    def covariance(self, sigmas: Mapping[str, float]) -> Floats:
         """Return the covariance (6, 6) of the change from the sigma in px of each kind of observation."""
         return sum((sigmas[kind] ** 2 * spread for kind, spread in self.spreads.items()), np.zeros((6, 6)))
 
@@ -64,8 +66,8 @@ class DriftReference:
     """
 
     rig: StereoRig
-    shared: NDArray[np.float64]
-    covariance: NDArray[np.float64]
+    shared: Floats
+    covariance: Floats
     sigmas: Mapping[str, float]
     pose_changes: tuple[PoseChange, ...]
 
@@ -133,7 +135,7 @@ def build_reference(rig: StereoRig, views: Sequence[DriftView]) -> DriftReferenc
 
 
 def solve_change(
-    e: LinearView, shared: NDArray[np.float64], sigmas: Mapping[str, float], supported: NDArray[np.bool_]
+    e: LinearView, shared: Floats, sigmas: Mapping[str, float], supported: NDArray[np.bool_]
 ) -> PoseChange:
     """Estimate the projector's apparent change in one view by robust least squares, given the ``shared`` lens errors.
 
@@ -160,7 +162,7 @@ def solve_change(
         gain[6:] @ e.scale,
         float(growth),
         float(samples[has_both_axes].mean()) if has_both_axes.any() else float("nan"),
-        float(np.sqrt(np.mean(unexplained**2))),
+        rms(unexplained),
     )
 
 
@@ -175,8 +177,7 @@ def _prior_information(rig: StereoRig) -> np.ndarray:
     for field in (DisplacementField(rig.camera.size), DisplacementField(rig.projector.size)):
         one = field.roughness / ROUGHNESS_PX**2 + sp.eye(field.unknowns) / HEIGHT_PX**2
         blocks += [one, one]
-    prior: np.ndarray = sp.block_diag(blocks).toarray()
-    return prior
+    return sp.block_diag(blocks).toarray()
 
 
 def _compute_weights(
@@ -197,8 +198,7 @@ def _least_squares_gain(J: np.ndarray, w: np.ndarray) -> np.ndarray:
     weighted = np.where(w > 0, w, 0.0)[:, None] * np.nan_to_num(J)
     N = weighted.T @ np.nan_to_num(J)
     s = 1 / np.sqrt(np.maximum(np.diag(N), 1e-300))[:, None]
-    gain: np.ndarray = s * (np.linalg.pinv(N * s * s.T, rcond=1e-13, hermitian=True) @ (s * weighted.T))
-    return gain
+    return s * (np.linalg.pinv(N * s * s.T, rcond=1e-13, hermitian=True) @ (s * weighted.T))
 
 
 def _reduce_normal_equations(e: LinearView, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

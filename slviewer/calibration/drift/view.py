@@ -13,11 +13,14 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
+from slviewer.calibration.board_pose import solve_pose
 from slviewer.calibration.observe import AXES, Observation
 from slviewer.errors import InputError
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.rig import StereoRig
-from slviewer.geometry.rigid import transform_from_rvec
+from slviewer.geometry.rigid import Floats
+from slviewer.geometry.splines import cubic_basis, second_differences
+from slviewer.geometry.vectors import unit_vectors
 
 SAMPLES = 1000
 """Number of pixels of the board at which the projector's coordinates are compared."""
@@ -35,10 +38,10 @@ class DriftView:
     ``projector`` coordinates (m, 2) px there, a column of NaN for an axis that was not captured."""
 
     name: str
-    points: NDArray[np.float64]
-    camera: NDArray[np.float64]
-    pixels: NDArray[np.float64]
-    projector: NDArray[np.float64]
+    points: Floats
+    camera: Floats
+    pixels: Floats
+    projector: Floats
 
     @classmethod
     def from_observation(cls, observation: Observation) -> "DriftView":
@@ -80,10 +83,11 @@ class DisplacementField:
         """Number of coefficients of one of the two components."""
         return (self.cells[0] + 3) * (self.cells[1] + 3)
 
-    def basis(self, pixels: NDArray[np.float64]) -> sp.csr_array:
+    def basis(self, pixels: Floats) -> sp.csr_array:
         """Return the spline basis (n, unknowns) at pixels (n, 2): displacement by coefficients."""
         (i, wu), (j, wv) = (
-            _splines_at((pixels[:, k] + 0.5) * self.cells[k] / self.size[k], self.cells[k]) for k in (0, 1)
+            cubic_basis(np.clip(pixels[:, k], -0.5, size - 0.5), -0.5, size - 0.5, cells)
+            for k, (size, cells) in enumerate(zip(self.size, self.cells, strict=True))
         )
         columns = (j[:, None] + np.arange(4))[:, :, None] * (self.cells[0] + 3) + (i[:, None] + np.arange(4))[:, None]
         values = wv[:, :, None] * wu[:, None]
@@ -95,11 +99,7 @@ class DisplacementField:
         """Quadratic form (unknowns, unknowns) of the squared second differences of one component's coefficients."""
         across, down = (n + 3 for n in self.cells)
 
-        def difference(n: int) -> sp.csr_array:
-            """Return the second differences (n - 2, n) of n coefficients."""
-            return sp.csr_array(sp.diags([1.0, -2.0, 1.0], [0, 1, 2], shape=(n - 2, n)))
-
-        u, v = sp.kron(sp.eye(down), difference(across)), sp.kron(difference(down), sp.eye(across))
+        u, v = sp.kron(sp.eye(down), second_differences(across)), sp.kron(second_differences(down), sp.eye(across))
         return sp.csr_array(u.T @ u + v.T @ v)
 
 
@@ -115,17 +115,17 @@ class LinearView:
 
     name: str
     kinds: np.ndarray
-    residuals: NDArray[np.float64]
-    pose: NDArray[np.float64]
-    change: NDArray[np.float64]
-    scale: NDArray[np.float64]
+    residuals: Floats
+    pose: Floats
+    change: Floats
+    scale: Floats
     shared: sp.csr_array
-    across: NDArray[np.float64]
+    across: Floats
 
     @property
     def usable(self) -> NDArray[np.bool_]:
         """(k,) bool: the rows that were measured."""
-        return np.asarray(np.isfinite(self.residuals) & np.isfinite(self.change).all(1))
+        return np.isfinite(self.residuals) & np.isfinite(self.change).all(1)
 
 
 def linearise_view(rig: StereoRig, view: DriftView) -> LinearView:
@@ -161,20 +161,11 @@ def linearise_view(rig: StereoRig, view: DriftView) -> LinearView:
         """Return the derivatives of a projector coordinate by the camera's field, u and v components."""
         return [-sp.csr_array(sp.diags(np.nan_to_num(J[:, row, k])) @ at_pixels) for k in (0, 1)]
 
-    nothing = sp.csr_array((n, projector.unknowns)), sp.csr_array((m, projector.unknowns))
     interleaved = [sp.csr_array(sp.kron(on_features, np.eye(2)[:, k : k + 1])) for k in (0, 1)]
-    twice = sp.csr_array((2 * n, projector.unknowns))
-    shared = sp.csr_array(
-        sp.vstack(
-            [
-                sp.hstack([*interleaved, twice, twice]),
-                sp.hstack([*moved_by(0), on_samples, nothing[1]]),
-                sp.hstack([*moved_by(1), nothing[1], on_samples]),
-            ]
-        )
-    )
-    towards = np.stack([columns[3 + k][2 * n :].reshape(2, m).T for k in range(3)], 2) @ T[:3, 2]  # along the normal
-    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+    rows = [*interleaved, None, None], [*moved_by(0), on_samples, None], [*moved_by(1), None, on_samples]
+    shared = sp.block_array(rows, format="csr")
+    by_shift = np.stack([column[2 * n :].reshape(2, m).T for column in columns[3:6]], 2)
+    towards = unit_vectors(by_shift @ T[:3, 2])  # along the normal
     return LinearView(
         view.name,
         np.repeat([0, 1, 2], [2 * n, m, m]),
@@ -192,22 +183,9 @@ def _flatten(camera: np.ndarray, projector: np.ndarray) -> np.ndarray:
     return np.concatenate([camera.ravel(), projector[:, 0], projector[:, 1]])
 
 
-def _splines_at(x: np.ndarray, cells: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return each position's cell (n,), clipped to the image, and its four cubic B-spline weights (n, 4)."""
-    x = np.clip(x, 0.0, cells)
-    cell = np.minimum(x.astype(np.int64), cells - 1)
-    f = x - cell
-    g = 1.0 - f
-    return cell, np.stack([g**3, 3 * f**3 - 6 * f**2 + 4, 3 * g**3 - 6 * g**2 + 4, f**3], 1) / 6.0
-
-
 def _solve_pose(rig: StereoRig, view: DriftView) -> np.ndarray:
     """Solve T_camera_board (4, 4) mm from the features in the camera; raises InputError without a solution."""
-    rays = rig.camera.undistort(view.camera)
-    try:
-        success, rvec, tvec = cv2.solvePnP(view.points, rays[:, None], np.eye(3), None, flags=cv2.SOLVEPNP_ITERATIVE)
-    except cv2.error:
-        success = False
-    if not success:
+    T = solve_pose(view.points, rig.camera.undistort(view.camera), np.eye(3), np.zeros(5))
+    if T is None:
         raise InputError(f"{view.name}: no pose of the board fits its features: is it the calibration's board?")
-    return transform_from_rvec(rvec, tvec)
+    return T

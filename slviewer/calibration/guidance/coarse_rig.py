@@ -8,19 +8,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slviewer.calibration.splined.board_shape import (
-    GAUGE_MM,
-    HEIGHT_SIGMA_MM,
-    HEIGHT_TERMS,
-    OFFSET_SIGMA_MM,
-    board_frame,
-    offset_gauge,
-)
+from slviewer.calibration.splined.board_shape import HEIGHT_TERMS, board_frame, offset_gauge
 from slviewer.calibration.splined.fields import CELLS_ACROSS, RIDGE, Device, roughness
-from slviewer.calibration.splined.unknowns import Arrangement, UnknownLayout
+from slviewer.calibration.splined.prior import Prior
+from slviewer.calibration.splined.unknowns import Arrangement, State, UnknownLayout
 from slviewer.geometry.lens import Lens
+from slviewer.geometry.polynomial import grid_points
 from slviewer.geometry.rig import StereoRig
 from slviewer.geometry.rigid import Floats, move_points, nearest_rotation, rotation_angle, transform_from_rvec
+from slviewer.geometry.vectors import finite_rows, lengths
 from slviewer.target.board import Board
 
 COARSE_CELLS = 10
@@ -31,7 +27,7 @@ BOARD_SAMPLES = 4000
 """Bright pixels that a pose contributes to the joint adjustment."""
 MARGIN = 0.006
 """Margin around the outermost features in a visible pose, in widths of the image."""
-MIN_POSES = 3
+MIN_POSES, MIN_FEATURES = 3, 12
 MAX_FEATURES = 60
 """Features of a pose from which a rig is estimated."""
 POSES_FOR_TWO_COEFFICIENTS = 6
@@ -84,9 +80,8 @@ class GuidanceModel:
     def points(self) -> np.ndarray:
         """(f, 3) mm: features that represent all those of the board."""
         low, high = self.board.points.min(0), self.board.points.max(0)
-        x, y = np.meshgrid(*(np.linspace(low[k], high[k], n) for k, n in enumerate(FEATURES)))
-        grid = np.column_stack([x.ravel(), y.ravel()])
-        nearest = np.argmin(np.linalg.norm(self.board.points[None, :, :2] - grid[:, None], axis=2), axis=1)
+        grid = grid_points(*(np.linspace(low[k], high[k], n) for k, n in enumerate(FEATURES)))
+        nearest = np.argmin(lengths(self.board.points[None, :, :2] - grid[:, None]), axis=1)
         return np.ascontiguousarray(self.board.points[np.unique(nearest)])
 
     @cached_property
@@ -95,10 +90,15 @@ class GuidanceModel:
         return board_frame(self.board.points)
 
     @cached_property
+    def state(self) -> State:
+        """Values of the unknowns without poses: a flat board."""
+        flat, offsets = np.zeros(HEIGHT_TERMS), np.zeros((len(self.points), 2))
+        return State(self.rig, np.zeros((0, 3, 3)), np.zeros((0, 3)), flat, offsets)
+
+    @property
     def layout(self) -> UnknownLayout:
         """Order of the unknowns, without poses."""
-        knots = [device.coefficients[0].size for device in (self.rig.camera, self.rig.projector)]
-        return UnknownLayout(0, len(self.points), knots[0], knots[1])
+        return self.state.layout
 
     @property
     def features_per_point(self) -> float:
@@ -112,8 +112,8 @@ class GuidanceModel:
         """
         outline = self.board.outline()
         shares = [(np.arange(n) + 0.5) / n for n in SAMPLES]
-        x, y = np.meshgrid(*(outline[0, k] + share * np.ptp(outline[:, k]) for k, share in enumerate(shares)))
-        pixels, visible = self._project(T_camera_board, np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)]), 0)
+        grid = grid_points(*(outline[0, k] + share * np.ptp(outline[:, k]) for k, share in enumerate(shares)))
+        pixels, visible = self._project(T_camera_board, np.pad(grid, ((0, 0), (0, 1))), 0)
         return [p[v] for p, v in zip(pixels, visible, strict=True)]
 
     def is_visible(self, T_camera_board: Floats) -> NDArray[np.bool_]:
@@ -128,30 +128,26 @@ class GuidanceModel:
         widths of the image.
         """
         X = move_points(T_camera_board, points)
-        pixels, camera, projector = self.stereo.camera.project(X), self.stereo.camera, self.stereo.projector
-        return pixels, _is_inside(pixels, camera, margin) & _is_inside(self.stereo.project(X), projector, margin)
+        camera, projector = self.stereo.camera, self.stereo.projector
+        pixels = camera.project(X)
+        seen = camera.contains(pixels, margin * camera.size[0])
+        return pixels, seen & projector.contains(self.stereo.project(X), margin * projector.size[0])
 
     def prior(self) -> Floats:
         """Return the information matrix (unknowns, unknowns) before any pose, in the order of ``layout``."""
         at = self.layout
         A = np.zeros((at.size, at.size))
-        diagonal = np.arange(at.size)
-        A[diagonal[:HEIGHT_TERMS], diagonal[:HEIGHT_TERMS]] = HEIGHT_SIGMA_MM**-2.0
-        offsets = slice(at.offsets, at.rig)
-        each = np.eye(at.rig - at.offsets) * self.features_per_point / OFFSET_SIGMA_MM**2
-        gauge = offset_gauge(self.points)
-        A[offsets, offsets] = each + gauge.T @ gauge / GAUGE_MM**2
-        A[diagonal[at.rig : at.camera_field], diagonal[at.rig : at.camera_field]] = self._weak_prior_sigmas() ** -2.0
-        widths = self.stereo.camera.size[0], self.stereo.projector.size[0]
-        starts = at.camera_field, at.projector_field
-        for device, start, strength, width in zip(self.rig[:2], starts, self.expected.strengths, widths, strict=True):
-            n = device.coefficients[0].size
+        cell_ratio = CELLS_ACROSS / COARSE_CELLS
+        forms, strengths = [], []
+        for device, strength in zip(self.rig[:2], self.expected.strengths, strict=True):
             # the same curvature energy of a field, and the same ridge, as on the adjustment's knots
-            cell_ratio = CELLS_ACROSS / COARSE_CELLS
-            form = roughness(device.coefficients) + RIDGE * (cell_ratio**4 - 1) * np.eye(n)
-            for k in range(2):
-                block = slice(start + k * n, start + (k + 1) * n)
-                A[block, block] = strength / width**2 / cell_ratio**2 * form
+            form = roughness(device.coefficients)
+            forms.append(form + RIDGE * (cell_ratio**4 - 1) * np.eye(len(form)))
+            strengths.append(strength / device.size[0] ** 2 / cell_ratio**2)
+        prior = Prior((forms[0], forms[1]), offset_gauge(self.points), self.features_per_point)
+        prior.add(A, np.zeros(at.size), self.state, strengths)
+        rig = np.arange(at.rig, at.camera_field)
+        A[rig, rig] += self._weak_prior_sigmas() ** -2.0
         return A
 
     def _weak_prior_sigmas(self) -> Floats:
@@ -170,13 +166,6 @@ def _coarse_device(lens: Lens) -> Device:
     return Device(lens.parameters, np.zeros((2, down + 3, COARSE_CELLS + 3)), np.array(lens.size, float))
 
 
-def _is_inside(pixels: Floats, lens: Lens, margin: float) -> NDArray[np.bool_]:
-    """(...,) bool: pixels (..., 2) inside the lens's image less a margin in image widths; False for NaN."""
-    margin_px = margin * lens.size[0]
-    with np.errstate(invalid="ignore"):
-        return np.asarray(((pixels > margin_px - 0.5) & (pixels < np.array(lens.size) - 0.5 - margin_px)).all(-1))
-
-
 def estimate_rig(
     points: Sequence[np.ndarray],
     camera: Sequence[np.ndarray],
@@ -188,36 +177,44 @@ def estimate_rig(
     Of each pose: ``points`` (n, 3) mm on the board, and their ``camera`` and ``projector`` pixels (n, 2), NaN where
     unknown. ``sizes``: (width, height) px of camera and projector.
     """
-    chosen = []
-    for p, c, q in zip(points, camera, projector, strict=True):
-        known = np.nonzero(np.isfinite(c).all(1) & np.isfinite(q).all(1))[0]
-        if len(known) < 12:
-            return None
-        subset = known[np.unique(np.linspace(0, len(known) - 1, MAX_FEATURES).astype(int))]
-        chosen.append([np.ascontiguousarray(a[subset], np.float32) for a in (p, c, q)])
-    if len(chosen) < MIN_POSES:
+    features = [_select_features(*each) for each in zip(points, camera, projector, strict=True)]
+    if len(features) < MIN_POSES or any(len(each[0]) < MIN_FEATURES for each in features):
         return None
-    flags = cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
-    if len(chosen) < POSES_FOR_TWO_COEFFICIENTS:
-        flags |= cv2.CALIB_FIX_K2
-    lenses, poses = [], []
-    for k, size in enumerate(sizes):
-        objects, images = [c[0] for c in chosen], [c[1 + k] for c in chosen]
-        try:
-            _, K, D, rvecs, tvecs = cv2.calibrateCamera(objects, images, size, np.eye(3), np.zeros(5), flags=flags)
-        except cv2.error:
-            return None
-        if not (np.isfinite(K).all() and all(_FOCALS[0] < f / size[0] < _FOCALS[1] for f in (K[0, 0], K[1, 1] / 2))):
-            return None
-        lenses.append(Lens(K, np.ravel(D)[:5], size))
-        poses.append([transform_from_rvec(r, t) for r, t in zip(rvecs, tvecs, strict=True)])
+    boards, *images = zip(*features, strict=True)
+    devices = [_calibrate_device(boards, seen, size) for seen, size in zip(images, sizes, strict=True)]
+    if devices[0] is None or devices[1] is None:
+        return None
+    lenses, poses = zip(*devices, strict=True)
     T = np.array(poses[1]) @ np.linalg.inv(poses[0])  # T_projector_camera by each pose
     t = np.median(T[:, :3, 3], axis=0)
     R = nearest_rotation(np.median(T[:, :3, :3], axis=0))
     rotation = np.median(rotation_angle(T[:, :3, :3] @ R.T))
-    translation = np.median(np.linalg.norm(T[:, :3, 3] - t, axis=1)) / max(float(np.linalg.norm(t)), 1e-9)
-    if rotation > MAX_DISAGREEMENT[0] or translation > MAX_DISAGREEMENT[1]:
-        return None
-    if any(pose[2, 3] <= 0 for pose in poses[0]):
+    translation = np.median(lengths(T[:, :3, 3] - t)) / max(float(np.linalg.norm(t)), 1e-9)
+    is_behind = any(pose[2, 3] <= 0 for pose in poses[0])
+    if rotation > MAX_DISAGREEMENT[0] or translation > MAX_DISAGREEMENT[1] or is_behind:
         return None
     return StereoRig(lenses[0], lenses[1], R, t), poses[0]
+
+
+def _select_features(points: np.ndarray, camera: np.ndarray, projector: np.ndarray) -> list[NDArray[np.float32]]:
+    """Return at most MAX_FEATURES of a pose's points and pixels (k, ...) float32, of those that both devices see."""
+    known = np.nonzero(finite_rows(camera, projector))[0]
+    if len(known):
+        known = known[np.unique(np.linspace(0, len(known) - 1, MAX_FEATURES).astype(int))]
+    return [np.ascontiguousarray(each[known], np.float32) for each in (points, camera, projector)]
+
+
+def _calibrate_device(
+    points: Sequence[np.ndarray], pixels: Sequence[np.ndarray], size: tuple[int, int]
+) -> tuple[Lens, list[Floats]] | None:
+    """Estimate a lens and T_device_board (4, 4) mm of each pose; None without a plausible solution."""
+    flags = cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
+    if len(points) < POSES_FOR_TWO_COEFFICIENTS:
+        flags |= cv2.CALIB_FIX_K2
+    try:
+        _, K, D, rvecs, tvecs = cv2.calibrateCamera(points, pixels, size, np.eye(3), np.zeros(5), flags=flags)
+    except cv2.error:
+        return None
+    if not (np.isfinite(K).all() and all(_FOCALS[0] < f / size[0] < _FOCALS[1] for f in (K[0, 0], K[1, 1] / 2))):
+        return None
+    return Lens(K, np.ravel(D)[:5], size), [transform_from_rvec(r, t) for r, t in zip(rvecs, tvecs, strict=True)]

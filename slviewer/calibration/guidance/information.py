@@ -9,13 +9,21 @@ from scipy.linalg import cholesky, eigh, solve_triangular
 
 from slviewer.calibration.guidance.coarse_rig import BOARD_SAMPLES, GuidanceModel
 from slviewer.calibration.splined.board_shape import HEIGHT_TERMS
-from slviewer.calibration.splined.normal import allocate_workspace
+from slviewer.calibration.splined.normal import (
+    ROW,
+    allocate_workspace,
+    dense_columns,
+    fill_feature_fields,
+    fill_sample_fields,
+    set_feature_columns,
+    set_sample_columns,
+)
 from slviewer.calibration.splined.posterior import compute_point_jacobian
-from slviewer.calibration.splined.residuals import DENSE, HEIGHT, OFFSET, feature_row, sample_row
-from slviewer.calibration.splined.unknowns import RIG, State
-from slviewer.calibration.splined.volume import Volume, depth_axis, remove_rigid_motion, working_volume
+from slviewer.calibration.splined.residuals import HEIGHT, feature_row, sample_row
+from slviewer.calibration.splined.volume import Volume, remove_rigid_motion, select_depth_axis, working_volume
 from slviewer.geometry.jit import kernel
 from slviewer.geometry.rigid import Floats
+from slviewer.geometry.vectors import finite_rows
 
 NEGLIGIBLE = 1e-4
 """Share of the points' mean variance that gains neglect."""
@@ -34,9 +42,10 @@ class VolumeSensitivity:
     def from_model(cls, model: GuidanceModel, depths_mm: tuple[float, float]) -> "VolumeSensitivity":
         """Compute the Jacobian of a regular grid of points; ``depths_mm``: nearest and farthest board."""
         volume = working_volume(model.rig, depths_mm)
-        state = State(model.rig, np.zeros((0, 3, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros((len(model.points), 2)))
-        by_rig = compute_point_jacobian(state, depth_axis(model.rig, volume), volume.pixels, volume.z).toarray()
-        known = np.isfinite(by_rig).all(axis=1).reshape(-1, 3).all(axis=1)
+        by_rig = compute_point_jacobian(
+            model.state, select_depth_axis(model.rig, volume), volume.pixels, volume.z
+        ).toarray()
+        known = finite_rows(by_rig.reshape(len(volume.z), -1))
         volume = Volume(volume.pixels[known], volume.z[known], volume.points[known], volume.projector[known])
         by_rig = by_rig.reshape(len(known), 3, -1)[known].reshape(3 * len(volume.z), -1)
         jacobian = np.zeros((len(by_rig), model.layout.size))
@@ -99,7 +108,7 @@ def information_rows(model: GuidanceModel, T_camera_board: Floats) -> list[Float
     the pose projected out, so that J.T @ J is the information. Rows of what a device does not see are 0.
     """
     at = model.layout
-    starts = np.array([at.height, at.offsets, at.rig, at.camera_field, at.projector_field]) + POSE
+    starts = at.starts + POSE
     widths = model.stereo.camera.size[0], model.stereo.projector.size[0]
     feature_sigma = model.expected.feature * widths[0] / np.sqrt(model.features_per_point)
     information = []
@@ -122,48 +131,29 @@ def _fill_rows(rig, R, t, points, frame, pixels, feature_weight, sample_weight, 
 
     ``at``: indices at which height, offsets, rig, camera field and projector field start in a row.
     """
-    work = allocate_workspace()
-    row, by_field = np.zeros((2, DENSE)), np.zeros((2, 2))
+    work, row, by_field, cells = allocate_workspace(), np.zeros((2, ROW)), np.zeros((2, 2)), np.zeros(4, np.int64)
     heights, nowhere = np.zeros(HEIGHT_TERMS), np.zeros(2)
-    stride, across = rig.camera.coefficients.shape[2], rig.projector.coefficients.shape[2]
-    knots, others = stride * rig.camera.coefficients.shape[1], across * rig.projector.coefficients.shape[1]
+    columns = dense_columns(at)
+    columns[:POSE] = np.arange(POSE)
     for n in range(points.shape[0]):
         u, _, ci, cj = feature_row(rig, R, t, heights, frame, points[n], nowhere, work, row)
-        if not np.isfinite(u):
-            continue
-        for k in range(2):
-            out = rows[2 * n + k]
-            _copy_dense(out, row[k], feature_weight, at)
-            for c in range(2):
-                out[at[1] + 2 * n + c] = feature_weight * row[k, OFFSET + c]
-            _add_field(out, feature_weight, work.camera_basis, at[3] + k * knots + cj * stride + ci, stride)
+        if np.isfinite(u):
+            set_feature_columns(columns, rig, n, ci, cj, at)
+            fill_feature_fields(row, work)
+            _scatter_row(row, columns, feature_weight, rows[2 * n : 2 * n + 2])
+    samples = rows[2 * points.shape[0] :]
     for n in range(pixels.shape[0]):
         u, _, ci, cj, pi, pj = sample_row(rig, R, t, heights, frame, pixels[n, 0], pixels[n, 1], work, row, by_field)
-        if not np.isfinite(u):
-            continue
-        for k in range(2):
-            out = rows[2 * (points.shape[0] + n) + k]
-            _copy_dense(out, row[k], sample_weight, at)
-            for c in range(2):
-                start = at[3] + c * knots + cj * stride + ci
-                _add_field(out, sample_weight * by_field[k, c], work.camera_basis, start, stride)
-            _add_field(out, sample_weight, work.projector_basis, at[4] + k * others + pj * across + pi, across)
+        if np.isfinite(u):
+            cells[0], cells[1], cells[2], cells[3] = ci, cj, pi, pj
+            set_sample_columns(columns, rig, cells, at)
+            fill_sample_fields(row, work, by_field)
+            _scatter_row(row, columns, sample_weight, samples[2 * n : 2 * n + 2])
 
 
 @kernel()
-def _copy_dense(out, row, weight, at):
-    """Copy the weighted derivatives by pose, board height, and the rig's parameters into a full row."""
-    for c in range(HEIGHT):
-        out[c] = weight * row[c]
-    for c in range(HEIGHT_TERMS):
-        out[at[0] + c] = weight * row[HEIGHT + c]
-    for c in range(RIG):
-        out[at[2] + c] = weight * row[OFFSET + 2 + c]
-
-
-@kernel()
-def _add_field(out, weight, basis, start, stride):
-    """Add the weighted values of the 16 splines of one field component to a full row."""
-    for a in range(4):
-        for b in range(4):
-            out[start + a * stride + b] += weight * basis[2, a] * basis[0, b]
+def _scatter_row(row, columns, weight, out):
+    """Add the weighted derivatives (2, ROW) of an observation to full rows (2, unknowns), each to its column."""
+    for k in range(2):
+        for c in range(ROW):
+            out[k, columns[c]] += weight * row[k, c]

@@ -11,6 +11,7 @@ from slviewer.calibration.guidance.coarse_rig import GuidanceModel
 from slviewer.calibration.guidance.information import RigInformation, VolumeSensitivity, information_rows
 from slviewer.calibration.next_pose import depth_range
 from slviewer.geometry.rigid import Floats, rigid_transform, rotation_angle
+from slviewer.geometry.vectors import box_middle, lengths
 
 DEPTHS = (0.0, 0.2, 0.45, 0.75, 1.1, 1.45)
 """Candidate depths, from nearest (0) to farthest (1) recommended depth, and beyond it."""
@@ -72,7 +73,7 @@ def list_candidate_poses(model: GuidanceModel) -> Floats:
     """
     camera, board = model.stereo.camera, model.board
     near, far = depth_range(board, camera)
-    middle = (board.points.min(0) + board.points.max(0)) / 2
+    middle = box_middle(board.points)
     width, height = camera.size
     steps = np.linspace(0, 1, _OFFSETS)
     u, v = (a.ravel() for a in np.meshgrid(steps * (width - 1), steps * (height - 1)))
@@ -98,7 +99,7 @@ def _select_extremes(places: Floats) -> list[int]:
     For direction (0, 0): the place nearest to the centre of their bounding box.
     """
     penalty = 0.01 * (places**2).sum(1)  # of two equally far places the more central one
-    off_centre = ((places - (places.min(0) + places.max(0)) / 2) ** 2).sum(1)
+    off_centre = ((places - box_middle(places)) ** 2).sum(1)
     return sorted(
         {int(np.argmax(places @ np.array(d) - penalty) if any(d) else np.argmin(off_centre)) for d in DIRECTIONS}
     )
@@ -106,5 +107,5 @@ def _select_extremes(places: Floats) -> list[int]:
 
 def _pose_distances(T: Floats, others: Floats) -> Floats:
     """Return distances (n,) of a pose (4, 4) to others (n, 4, 4): shift over 0.1 depth, plus turn over 15 degrees."""
-    translations = np.linalg.norm(T[:3, 3] - others[:, :3, 3], axis=1) / (0.1 * T[2, 3])
-    return np.asarray(translations + rotation_angle(T[:3, :3].T @ others[:, :3, :3]) / np.radians(15))
+    translations = lengths(T[:3, 3] - others[:, :3, 3]) / (0.1 * T[2, 3])
+    return translations + rotation_angle(T[:3, :3].T @ others[:, :3, :3]) / np.radians(15)

@@ -13,6 +13,7 @@ from slviewer.calibration.splined.bundle import Bundle, PoseFit
 from slviewer.calibration.splined.half_turns import detect_half_turns, is_numbering_ambiguous, renumber_poses
 from slviewer.calibration.splined.normal import (
     BlockFactor,
+    ObservedValues,
     PoseData,
     factorize,
     normal_equations,
@@ -46,8 +47,26 @@ def gather_data(observations: Sequence[Observation], stereo: StereoModel) -> tup
     Returns their names, the observations, and the samples' predicted noise (m, 2) px. Raises InputError for fewer than
     MIN_POSES poses with both axes, and for observations without samples.
     """
-    used = [o for o in observations if o.name in stereo.poses]
-    both = [o for o in used if len(o.surfaces) == 2]
+    both = _select_complete(observations, stereo)
+    every = np.concatenate([o.points for o in both])
+    points, feature = np.unique(np.round(every, 6), axis=0, return_inverse=True)
+    samples = [o.samples for o in both if o.samples is not None]
+    data = PoseData(
+        np.cumsum([0, *(len(o.points) for o in both)]),
+        feature.ravel().astype(np.int64),
+        np.ascontiguousarray(np.concatenate([o.camera for o in both])),
+        np.cumsum([0, *(len(s.camera) for s in samples)]),
+        np.concatenate([s.camera for s in samples]),
+        np.concatenate([s.projector for s in samples]),
+        points,
+        board_frame(points),
+    )
+    return [o.name for o in both], data, np.concatenate([s.sigma for s in samples])
+
+
+def _select_complete(observations: Sequence[Observation], stereo: StereoModel) -> list[Observation]:
+    """Select the observations of ``gather_data``; raises its errors."""
+    both = [o for o in observations if o.name in stereo.poses and len(o.surfaces) == 2]
     if len(both) < MIN_POSES:
         single = sorted({axis for o in observations for axis in o.surfaces}) if len(both) < len(observations) else []
         alone = f"; others hold axis {' or '.join(single)} alone" if single else ""
@@ -57,25 +76,7 @@ def gather_data(observations: Sequence[Observation], stereo: StereoModel) -> tup
         )
     if any(o.samples is None for o in both):
         raise InputError("these target poses were read without samples of their phase: calibrate from the frames again")
-    every = np.concatenate([o.points for o in both])
-    points, feature = np.unique(np.round(every, 6), axis=0, return_inverse=True)
-    samples = [o.samples for o in both if o.samples is not None]
-
-    def starts(lengths: list[int]) -> np.ndarray:
-        """Return where each pose's entries start, and the end of the last."""
-        return np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64)
-
-    data = PoseData(
-        starts([len(o.points) for o in both]),
-        feature.ravel().astype(np.int64),
-        np.ascontiguousarray(np.concatenate([o.camera for o in both])),
-        starts([len(s.camera) for s in samples]),
-        np.concatenate([s.camera for s in samples]),
-        np.concatenate([s.projector for s in samples]),
-        points,
-        board_frame(points),
-    )
-    return [o.name for o in both], data, np.concatenate([s.sigma for s in samples])
+    return both
 
 
 def adjust_bundle(
@@ -173,7 +174,7 @@ def _adjust(
     )
 
 
-def _residuals(state: State, data: PoseData) -> tuple[np.ndarray, np.ndarray]:
+def _residuals(state: State, data: PoseData) -> ObservedValues:
     """Return the residuals of features (n, 2) and of samples (m, 2), px."""
     features, samples = predict_observations(state, data)
     return data.feature_px - features, data.projector_px - samples
@@ -181,8 +182,8 @@ def _residuals(state: State, data: PoseData) -> tuple[np.ndarray, np.ndarray]:
 
 def _cost(
     state: State,
-    residuals: tuple[np.ndarray, np.ndarray],
-    weights: tuple[np.ndarray, np.ndarray],
+    residuals: ObservedValues,
+    weights: ObservedValues,
     prior: Prior,
     strengths: Sequence[float],
 ) -> float:
@@ -196,12 +197,12 @@ def _cost(
 
 def _take_step(
     state: State,
-    residuals: tuple[np.ndarray, np.ndarray],
+    residuals: ObservedValues,
     data: PoseData,
-    cost: Callable[[State, tuple[np.ndarray, np.ndarray]], float],
+    cost: Callable[[State, ObservedValues], float],
     system: tuple[np.ndarray, np.ndarray, np.ndarray],
     damping: float,
-) -> tuple[State, tuple[np.ndarray, np.ndarray], np.ndarray, float]:
+) -> tuple[State, ObservedValues, np.ndarray, float]:
     """Take a Gauss-Newton step; damp it where it does not lower the cost.
 
     ``system``: information matrix, right-hand side, and full step. Only lenses and relative pose are damped: together
@@ -226,14 +227,12 @@ def _pack_factor(factor: np.ndarray) -> np.ndarray:
     return np.asarray(factor[np.tri(len(factor), dtype=bool)], np.float32)
 
 
-def _sigmas(
-    residuals: tuple[np.ndarray, np.ndarray], noise: Noise, sample_sigma: np.ndarray, data: PoseData
-) -> tuple[np.ndarray, np.ndarray]:
+def _sigmas(residuals: ObservedValues, noise: Noise, sample_sigma: np.ndarray, data: PoseData) -> ObservedValues:
     """Return the standard deviations of features (n, 2) and samples (m, 2), px."""
     return pose_sigmas(residuals[0], data.feature_from, noise), noise.sigmas(sample_sigma)
 
 
-def _zero_weights(weights: tuple[np.ndarray, np.ndarray], is_excluded: np.ndarray, data: PoseData) -> None:
+def _zero_weights(weights: ObservedValues, is_excluded: np.ndarray, data: PoseData) -> None:
     """Set the weights of the excluded poses (p,) bool to 0, in place."""
     for w, start in zip(weights, (data.feature_from, data.sample_from), strict=True):
         for i in np.nonzero(is_excluded)[0]:
@@ -242,8 +241,8 @@ def _zero_weights(weights: tuple[np.ndarray, np.ndarray], is_excluded: np.ndarra
 
 def _fit_statistics(
     names: Sequence[str],
-    residuals: tuple[np.ndarray, np.ndarray],
-    sigmas: tuple[np.ndarray, np.ndarray],
+    residuals: ObservedValues,
+    sigmas: ObservedValues,
     data: PoseData,
 ) -> dict[str, PoseFit]:
     """Compute the RMS residuals and the trust of each pose, excluded ones included."""
@@ -268,7 +267,7 @@ def _depth_range(state: State, data: PoseData, is_excluded: np.ndarray) -> tuple
     return float(z.min()), float(z.max())
 
 
-def _count_poses(state: State, weights: tuple[np.ndarray, np.ndarray], data: PoseData) -> tuple[np.ndarray, np.ndarray]:
+def _count_poses(state: State, weights: ObservedValues, data: PoseData) -> tuple[np.ndarray, np.ndarray]:
     """Count the poses that illuminated each cell (rows, columns) uint16 of the camera's and the projector's field."""
     counts = []
     for device, pixels in ((state.rig.camera, data.sample_px), (state.rig.projector, data.projector_px)):

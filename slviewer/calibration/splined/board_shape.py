@@ -7,6 +7,7 @@ ways, twist, and what bends in itself. Constants and slopes are missing because 
 import numpy as np
 
 from slviewer.geometry.jit import kernel
+from slviewer.geometry.vectors import unit_vectors
 
 HEIGHT_DEGREES = np.array([(i, total - i) for total in (2, 3, 4) for i in range(total, -1, -1)])
 """(12, 2): of the polynomials in x and y."""
@@ -30,7 +31,7 @@ def offset_gauge(points: np.ndarray) -> np.ndarray:
     x, y = (points[:, :2] - points[:, :2].mean(0)).T
     one, none = np.ones_like(x), np.zeros_like(x)
     rows = np.array([np.stack(pair, 1).ravel() for pair in ((one, none), (none, one), (-y, x), (x, y))])
-    return np.asarray(rows / np.linalg.norm(rows, axis=1, keepdims=True))
+    return unit_vectors(rows)
 
 
 @kernel()

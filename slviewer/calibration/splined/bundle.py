@@ -16,6 +16,10 @@ from slviewer.calibration.splined.residual_noise import Noise
 from slviewer.calibration.splined.unknowns import Arrangement, State
 from slviewer.fringe.sequence import Axis
 from slviewer.records.plain import from_plain, to_plain
+from slviewer.geometry.rigid import Floats
+
+_STATE_ARRAYS = ("R_board", "t_board", "heights", "offsets")
+_OWN_ARRAYS = ("points", "camera_poses", "projector_poses")
 
 
 @dataclass(frozen=True)
@@ -43,7 +47,7 @@ class Bundle:
 
     state: State
     poses: tuple[str, ...]
-    points: NDArray[np.float64]
+    points: Floats
     noise: Noise
     strengths: tuple[float, float]
     fits: Mapping[str, PoseFit]
@@ -77,7 +81,7 @@ class Bundle:
         """Return Y (unknowns, m), where Y.T @ Y is the covariance of the values with ``jacobian`` (m, unknowns)."""
         dense = jacobian if isinstance(jacobian, np.ndarray) else jacobian.toarray()
         right = np.asarray(dense, self.factor.dtype).T
-        return np.asarray(solve_triangular(self.factor, right, lower=True, check_finite=False))
+        return solve_triangular(self.factor, right, lower=True, check_finite=False)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the fields that are not arrays, as JSON types."""
@@ -95,18 +99,9 @@ class Bundle:
             for name, device in (("camera", rig.camera), ("projector", rig.projector))
             for key, value in device._asdict().items()
         }
-        return arrays | {
-            "R": rig.R,
-            "t": rig.t,
-            "R_board": self.state.R_board,
-            "t_board": self.state.t_board,
-            "heights": self.state.heights,
-            "offsets": self.state.offsets,
-            "points": self.points,
-            "camera_poses": self.camera_poses,
-            "projector_poses": self.projector_poses,
-            "factor": self.packed_factor,
-        }
+        arrays |= {name: getattr(self.state, name) for name in _STATE_ARRAYS}
+        arrays |= {name: getattr(self, name) for name in _OWN_ARRAYS}
+        return arrays | {"R": rig.R, "t": rig.t, "factor": self.packed_factor}
 
     @classmethod
     def from_arrays(cls, data: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> "Bundle":
@@ -117,19 +112,17 @@ class Bundle:
         ]
         a = {name: np.ascontiguousarray(values) for name, values in arrays.items()}
         rig = Arrangement(devices[0], devices[1], a["R"], a["t"])
-        state = State(rig, a["R_board"], a["t_board"], a["heights"], a["offsets"])
+        state = State(rig, *(a[name] for name in _STATE_ARRAYS))
         strengths, depths = data["strengths"], data["depth_range_mm"]
         return cls(
             state=state,
             poses=tuple(data["poses"]),
-            points=a["points"],
+            **{name: a[name] for name in _OWN_ARRAYS},
             noise=from_plain(data["noise"], Noise),
             strengths=(strengths[0], strengths[1]),
             fits={name: PoseFit(**fit) for name, fit in data["fits"].items()},
             excluded=data["left_out"],
             depth_range_mm=(depths[0], depths[1]),
-            camera_poses=a["camera_poses"],
-            projector_poses=a["projector_poses"],
             packed_factor=a["factor"],
             steps=data["steps"],
             half_turned_poses=tuple(data.get("turned", ())),

@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_erosion
 
 from slviewer.calibration.splined.correction_grid import evaluate
-from slviewer.calibration.splined.fields import distort_to_pixel, undistort_pixel
+from slviewer.calibration.splined.fields import project_point, undistort_pixel
 from slviewer.calibration.splined.unknowns import Arrangement
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.jit import kernel
+from slviewer.geometry.rigid import Floats
 
 GRID_CELLS_ACROSS = 100
 """Number of grid cells across the image's width: 16 px each at a width of 1600."""
@@ -66,10 +67,10 @@ class CompiledAxis:
         """Return |dz/ds| (h, w) float32 mm per px of the rational function at a phase map (h, w) rad."""
         c0, c1, c2 = self.coefficients
         s = phase * np.float32(px_per_rad) - np.float32(self.centre)
-        return np.asarray(np.abs(c1 - c0 * c2) / (1 + c2 * s) ** 2)
+        return np.abs(c1 - c0 * c2) / (1 + c2 * s) ** 2
 
 
-def pixel_rays(rig: Arrangement) -> NDArray[np.float64]:
+def pixel_rays(rig: Arrangement) -> Floats:
     """Return the undistorted normalised coordinates (2, h, w) float64 of the camera pixels."""
     width, height = (int(n) for n in rig.camera.size)
     rays = np.empty((2, height, width))
@@ -124,12 +125,7 @@ def _fill_rays(camera, rows, rays):
 @kernel()
 def _project_depth(rig, x, y, z, basis):
     """Return the projector pixel (u, v) of the point (x z, y z, z); NaN far outside its image."""
-    X0 = z * (rig.R[0, 0] * x + rig.R[0, 1] * y + rig.R[0, 2]) + rig.t[0]
-    X1 = z * (rig.R[1, 0] * x + rig.R[1, 1] * y + rig.R[1, 2]) + rig.t[1]
-    X2 = z * (rig.R[2, 0] * x + rig.R[2, 1] * y + rig.R[2, 2]) + rig.t[2]
-    if not X2 > 0.0:
-        return np.nan, np.nan
-    u, v = distort_to_pixel(rig.projector, X0 / X2, X1 / X2, basis)
+    u, v = project_point(rig, x, y, z, basis)
     width, height = rig.projector.size[0], rig.projector.size[1]
     if -MARGIN * width <= u <= (1.0 + MARGIN) * width and -MARGIN * height <= v <= (1.0 + MARGIN) * height:
         return u, v
@@ -149,23 +145,24 @@ def _depth_interval(rig, x, y, near, far, basis):
             last = z
         elif np.isfinite(first):
             break
-    for outward in range(2):  # to the edge itself, so that neighbouring pixels agree
-        inside = first if outward == 0 else last
-        limit = near if outward == 0 else far
-        if not np.isfinite(inside) or inside == limit:
-            continue
-        outside = inside + (limit - inside) / abs(limit - inside) * (far - near) / 32.0
-        for _ in range(20):
-            middle = 0.5 * (inside + outside)
-            if np.isfinite(_project_depth(rig, x, y, middle, basis)[0]):
-                inside = middle
-            else:
-                outside = middle
-        if outward == 0:
-            first = inside
-        else:
-            last = inside
+    step = (far - near) / 32.0  # to the edge itself, so that neighbouring pixels agree
+    if first > near:
+        first = _locate_edge(rig, x, y, first, first - step, basis)
+    if last < far:
+        last = _locate_edge(rig, x, y, last, last + step, basis)
     return first, last
+
+
+@kernel()
+def _locate_edge(rig, x, y, inside, outside, basis):
+    """Return the depth next to ``outside`` at which a ray is near the projector's image, by bisection."""
+    for _ in range(20):
+        middle = 0.5 * (inside + outside)
+        if np.isfinite(_project_depth(rig, x, y, middle, basis)[0]):
+            inside = middle
+        else:
+            outside = middle
+    return inside
 
 
 @kernel()
@@ -177,18 +174,11 @@ def _interpolate_rational(rig, row, centre, x, y, near, far, basis):
         if not last - first > 1e-3 * (far - near):
             return np.nan, np.nan, np.nan, np.nan, np.nan
     # nodes of Chebyshev's polynomial in 1/z, in which the coordinate is nearly linear
-    z0 = z1 = z2 = s0 = s1 = s2 = 0.0
-    a, b = 1.0 / last, 1.0 / first
-    for k in range(3):
-        z = 1.0 / (0.5 * (a + b) + 0.433 * (b - a) * (k - 1))
-        projected = _project_depth(rig, x, y, z, basis)
-        s = projected[row] - centre
-        if k == 0:
-            z0, s0 = z, s
-        elif k == 1:
-            z1, s1 = z, s
-        else:
-            z2, s2 = z, s
+    middle, half = 0.5 * (1.0 / last + 1.0 / first), 0.433 * (1.0 / first - 1.0 / last)
+    z0, z1, z2 = 1.0 / (middle - half), 1.0 / middle, 1.0 / (middle + half)
+    s0 = _project_depth(rig, x, y, z0, basis)[row] - centre
+    s1 = _project_depth(rig, x, y, z1, basis)[row] - centre
+    s2 = _project_depth(rig, x, y, z2, basis)[row] - centre
     # c0 + c1 s - c2 s z = z at the three, less the first
     m00, m01, r0 = s1 - s0, s0 * z0 - s1 * z1, z1 - z0
     m10, m11, r1 = s2 - s0, s0 * z0 - s2 * z2, z2 - z0

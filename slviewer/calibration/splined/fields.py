@@ -9,8 +9,9 @@ from typing import NamedTuple
 import numpy as np
 import scipy.sparse as sp
 
-from slviewer.geometry.brown import distort_point, undistort_point
+from slviewer.geometry.brown import distort_to_px, undistort_point
 from slviewer.geometry.jit import kernel
+from slviewer.geometry.splines import bending_energy
 
 CELLS_ACROSS = 26
 """Of any image: half a wavelength of the finest distortion that matters holds two or three cells."""
@@ -42,13 +43,7 @@ def no_displacement(size: tuple[int, int], cells_across: int | None = None) -> n
 def roughness(coefficients: np.ndarray) -> np.ndarray:
     """(n, n): the prior's quadratic form of one component's n coefficients, second differences and a small ridge."""
     rows, columns = coefficients.shape[1:]
-    first = [sp.diags([-1.0, 1.0], [0, 1], shape=(n - 1, n)) for n in (columns, rows)]
-    second = [sp.diags([1.0, -2.0, 1.0], [0, 1, 2], shape=(n - 2, n)) for n in (columns, rows)]
-    uu = sp.kron(sp.eye(rows), second[0])
-    vv = sp.kron(second[1], sp.eye(columns))
-    uv = sp.kron(first[1], first[0])
-    form = uu.T @ uu + 2.0 * uv.T @ uv + vv.T @ vv + RIDGE * sp.eye(rows * columns)
-    return np.asarray(form.toarray())
+    return (bending_energy(columns, rows) + RIDGE * sp.eye(rows * columns)).toarray()
 
 
 def undistort(device: Device, pixels: np.ndarray) -> np.ndarray:
@@ -126,13 +121,22 @@ def remove_displacement(device, u, v, basis):
 @kernel()
 def distort_to_pixel(device, x, y, basis):
     """The pixel of an undistorted normalised point, without derivatives; NaN past the fold of Brown's polynomial."""
-    k = device.numbers
-    if not x * x + y * y < k[9]:
-        return np.nan, np.nan
-    xd, yd, _, _, _ = distort_point(x, y, k)
-    u, v = k[0] * xd + k[2], k[1] * yd + k[3]
+    u, v = distort_to_px(x, y, device.numbers)
+    if np.isnan(u):
+        return u, v
     du, dv, _, _, _, _, _, _ = displacement(device, u, v, basis)
     return u + du, v + dv
+
+
+@kernel()
+def project_point(rig, x, y, z, basis):
+    """Return the projector's pixel of the point (x z, y z, z) mm in the camera's frame; NaN behind the projector."""
+    X0 = z * (rig.R[0, 0] * x + rig.R[0, 1] * y + rig.R[0, 2]) + rig.t[0]
+    X1 = z * (rig.R[1, 0] * x + rig.R[1, 1] * y + rig.R[1, 2]) + rig.t[1]
+    X2 = z * (rig.R[2, 0] * x + rig.R[2, 1] * y + rig.R[2, 2]) + rig.t[2]
+    if not X2 > 0.0:
+        return np.nan, np.nan
+    return distort_to_pixel(rig.projector, X0 / X2, X1 / X2, basis)
 
 
 @kernel()

@@ -13,6 +13,7 @@ from slviewer.calibration.splined.normal import PoseData, predict_observations
 from slviewer.calibration.splined.unknowns import State
 from slviewer.errors import InputError
 from slviewer.geometry.polynomial import monomials, scale_to_unit_square
+from slviewer.geometry.vectors import box_middle, finite_rows, lengths, unit_vectors
 from slviewer.target.board import Board
 
 DECISION_SIGMAS = 5.0
@@ -32,8 +33,8 @@ def is_numbering_ambiguous(notation: str) -> bool:
 
 def opposite_features(points: np.ndarray) -> np.ndarray | None:
     """Return the index (f,) of the feature opposite to each of ``points`` (f, 3) mm; None without that symmetry."""
-    middle = (points.min(0) + points.max(0)) / 2
-    away = np.linalg.norm((2 * middle - points)[:, None, :2] - points[None, :, :2], axis=2)
+    middle = box_middle(points)
+    away = lengths((2 * middle - points)[:, None, :2] - points[None, :, :2])
     partner = np.argmin(away, axis=1)
     apart = away[np.arange(len(points)), partner].max()
     return partner if apart < 1e-3 and np.array_equal(partner[partner], np.arange(len(points))) else None
@@ -49,8 +50,7 @@ def detect_half_turns(state: State, data: PoseData, residuals: np.ndarray, certa
     if partner is None or count < 3 or certain.all():
         return np.zeros(count, bool)
     reversed_part = _odd_part(_measure_offsets(state, data, residuals), partner, data.points)
-    length = np.linalg.norm(reversed_part, axis=1)
-    unit = reversed_part / np.maximum(length, 1e-12)[:, None]
+    unit = unit_vectors(reversed_part)
     alike = unit @ unit.T
     np.fill_diagonal(alike, 0.0)
     signs = np.sign(np.linalg.eigh(alike)[1][:, -1])
@@ -59,10 +59,10 @@ def detect_half_turns(state: State, data: PoseData, residuals: np.ndarray, certa
     signs = signs if chosen >= 0 else -signs
     total = signs @ reversed_part
     others = total - signs[:, None] * reversed_part
-    agree = np.einsum("pn,pn->p", unit, others) / np.maximum(np.linalg.norm(others, axis=1), 1e-12)
+    agree = np.einsum("pn,pn->p", unit, unit_vectors(others))
     # of two features that are each other's opposite only one counts, and what is smooth does not
     freedom = max(len(data.points) - (SMOOTH_DEGREE + 1) * (SMOOTH_DEGREE + 2) // 2, 1)
-    return np.asarray((agree * np.sqrt(freedom) < -DECISION_SIGMAS) & ~certain)
+    return (agree * np.sqrt(freedom) < -DECISION_SIGMAS) & ~certain
 
 
 def renumber_poses(state: State, data: PoseData, poses: np.ndarray) -> tuple[State, PoseData]:
@@ -70,7 +70,7 @@ def renumber_poses(state: State, data: PoseData, poses: np.ndarray) -> tuple[Sta
     partner = opposite_features(data.points)
     if partner is None or not poses.any():
         return state, data
-    middle = (data.points.min(0) + data.points.max(0)) / 2
+    middle = box_middle(data.points)
     feature, R, t = data.feature.copy(), state.R_board.copy(), state.t_board.copy()
     for i in np.nonzero(poses)[0]:
         part = slice(data.feature_from[i], data.feature_from[i + 1])
@@ -90,7 +90,7 @@ def _measure_offsets(state: State, data: PoseData, residuals: np.ndarray) -> np.
         step[:, k] = _STEP_MM
         by_place.append((predict_observations(replace(state, offsets=state.offsets + step), data)[0] - here) / _STEP_MM)
     J = np.stack(by_place, axis=2)  # of px by mm
-    usable = np.isfinite(J).all((1, 2)) & np.isfinite(residuals).all(1)
+    usable = finite_rows(J.reshape(len(J), -1), residuals)
     usable[usable] &= np.abs(np.linalg.det(J[usable])) > 1e-9
     deviations = np.zeros_like(residuals)
     deviations[usable] = np.linalg.solve(J[usable], residuals[usable][..., None])[..., 0]
@@ -109,4 +109,4 @@ def _odd_part(places: np.ndarray, partner: np.ndarray, points: np.ndarray) -> np
     odd = (places + places[:, partner]) / 2
     basis, _ = np.linalg.qr(monomials(scale_to_unit_square(points[:, :2]), SMOOTH_DEGREE))
     odd = odd - np.einsum("fk,gk,pgc->pfc", basis, basis, odd, optimize=True)
-    return np.asarray(odd.reshape(len(places), -1))
+    return odd.reshape(len(places), -1)

@@ -16,12 +16,13 @@ from slviewer.calibration.splined.fields import undistort
 from slviewer.calibration.splined.residual_noise import MIN_SIGMA_PX
 from slviewer.calibration.splined.uncertainty import SigmaMap, compute_sigma_map, summarise_volume_sigma
 from slviewer.calibration.splined.unknowns import Arrangement, pinhole_lens
-from slviewer.calibration.splined.volume import depth_axis, is_supported, working_volume
+from slviewer.calibration.splined.volume import in_illuminated_cells, select_depth_axis, working_volume
 from slviewer.calibration.stereo import StereoModel
-from slviewer.errors import InputError
 from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.rig import StereoRig
+from slviewer.geometry.triangulation import check_map
+from slviewer.geometry.vectors import rms
 
 NEAR, FAR = 0.7, 1.4
 """Of the nearest and the farthest calibrated depth: between them points are measured."""
@@ -74,7 +75,7 @@ class SplinedModel:
         NaN where no target pose illuminated the cell of one of them.
         """
         rays = undistort(self.rig.camera, pixels), undistort(self.rig.projector, projector)
-        known = is_supported(self.rig.camera, pixels, self.bundle.camera_poses > 0) & is_supported(
+        known = in_illuminated_cells(self.rig.camera, pixels, self.bundle.camera_poses > 0) & in_illuminated_cells(
             self.rig.projector, projector, self.bundle.projector_poses > 0
         )
         return np.where(known[:, None], rays[0], np.nan), np.where(known[:, None], rays[1], np.nan)
@@ -101,7 +102,7 @@ class SplinedModel:
 
     def compile_depth(self) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         """Compile the axis along which depth is measured, and its uncertainty; `restore_compiled` takes the result."""
-        axis = depth_axis(self.rig, working_volume(self.rig, self.bundle.depth_range_mm))
+        axis = select_depth_axis(self.rig, working_volume(self.rig, self.bundle.depth_range_mm))
         fast, sigma = self.fast_axis(axis), self.sigma_map(axis)
         data = {"axis": axis, "centre": fast.centre, "step": fast.step, "near": fast.near, "far": fast.far}
         return data, {
@@ -133,7 +134,7 @@ class SplinedModel:
         NaN where the phase is invalid, beyond ``depths_mm``, and, if ``supported``, in cells that no target pose
         illuminated.
         """
-        self._check(phase)
+        check_map(self.rig.camera.size, phase.phase, "phases")
         px_per_rad = phase.period_px / (2 * np.pi)
         return self.fast_axis(phase.axis).depth(phase.phase, px_per_rad, self.single_rays, supported)
 
@@ -143,7 +144,7 @@ class SplinedModel:
 
     def depth_per_rad(self, phase: PhaseMap) -> np.ndarray:
         """(h, w) float32: |dz/dphi| mm/rad at the phases measured."""
-        self._check(phase)
+        check_map(self.rig.camera.size, phase.phase, "phases")
         px_per_rad = phase.period_px / (2 * np.pi)
         return self.fast_axis(phase.axis).depth_per_px(phase.phase, px_per_rad) * np.float32(px_per_rad)
 
@@ -180,7 +181,7 @@ class SplinedModel:
         """Return the figures of ``text`` as plain values for JSON."""
         bundle = self.bundle
         fields = {
-            device: float(np.sqrt(np.mean(part.coefficients[:, 1:-1, 1:-1] ** 2)))
+            device: rms(part.coefficients[:, 1:-1, 1:-1])
             for device, part in (("camera", bundle.state.rig.camera), ("projector", bundle.state.rig.projector))
         }
         height = board_heights(bundle.points, board_frame(bundle.points), bundle.state.heights)
@@ -194,7 +195,7 @@ class SplinedModel:
             },
             "local_distortion_rms_px": fields,
             "board_height_mm": [float(height.min()), float(height.max())],
-            "board_offsets_rms_mm": float(np.sqrt(np.mean(bundle.state.offsets**2))),
+            "board_offsets_rms_mm": rms(bundle.state.offsets),
             "cells_lit": {
                 "camera": float(np.mean(bundle.camera_poses > 0)),
                 "projector": float(np.mean(bundle.projector_poses > 0)),
@@ -247,15 +248,6 @@ class SplinedModel:
     def from_arrays(cls, data: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> "SplinedModel":
         """The inverse of ``to_dict`` and ``to_arrays``."""
         return cls(Bundle.from_arrays(data, arrays))
-
-    def _check(self, phase: PhaseMap) -> None:
-        """Raise InputError for a phase map of another size than the camera's image."""
-        width, height = (int(n) for n in self.rig.camera.size)
-        if phase.phase.shape != (height, width):
-            raise InputError(
-                f"A phase map of shape {phase.phase.shape} was given, and the camera was calibrated at "
-                f"{width}x{height} px: use captures of the same camera, at the same resolution and without cropping."
-            )
 
 
 def calibrate_splined(

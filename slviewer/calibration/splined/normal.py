@@ -22,6 +22,10 @@ CAMERA_FIELD, PROJECTOR_FIELD, ROW = DENSE, DENSE + 2 * FIELD, DENSE + 4 * FIELD
 the dense part; and the row's length."""
 
 
+ObservedValues = tuple[np.ndarray, np.ndarray]
+"""A value of each coordinate of all features, (n, 2), and of all samples, (m, 2)."""
+
+
 class PoseData(NamedTuple):
     """What was observed, all poses one after another.
 
@@ -57,6 +61,22 @@ class Workspace(NamedTuple):
     normal: np.ndarray
 
 
+class Sums(NamedTuple):
+    """Sums of one thread over observations in the same cells, before they are added to the normal equations.
+
+    ``rows`` (4, ROW), ``w`` and ``r`` (4,): those of two observations, added at once, their weights and residuals;
+    ``S`` (ROW, ROW) and ``s`` (ROW,): their weighted products; ``columns`` (ROW,): of a row's entries, in the order of
+    the vector of unknowns.
+    """
+
+    rows: np.ndarray
+    w: np.ndarray
+    r: np.ndarray
+    S: np.ndarray
+    s: np.ndarray
+    columns: np.ndarray
+
+
 @kernel()
 def allocate_workspace():
     """Return a workspace of zeros."""
@@ -66,7 +86,7 @@ def allocate_workspace():
     )  # fmt: skip
 
 
-def predict_observations(state: State, data: PoseData) -> tuple[np.ndarray, np.ndarray]:
+def predict_observations(state: State, data: PoseData) -> ObservedValues:
     """Predict the features (n, 2) px and the samples' projector coordinates (m, 2) px; NaN where not visible."""
     features, samples = np.empty_like(data.feature_px), np.empty_like(data.sample_px)
     model = state.rig, state.R_board, state.t_board, state.heights, state.offsets
@@ -77,7 +97,7 @@ def predict_observations(state: State, data: PoseData) -> tuple[np.ndarray, np.n
 
 
 def normal_equations(
-    state: State, data: PoseData, residuals: tuple[np.ndarray, np.ndarray], weights: tuple[np.ndarray, np.ndarray]
+    state: State, data: PoseData, residuals: ObservedValues, weights: ObservedValues
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return J'WJ (N, N), of which the upper triangle is filled, and J'W r (N,).
 
@@ -87,9 +107,7 @@ def normal_equations(
     shares = _split_poses(layout.poses)
     matrices = [np.zeros((layout.size, layout.size)) for _ in shares]
     right = np.zeros((len(shares), layout.size))
-    at = np.array(
-        [layout.height, layout.offsets, layout.rig, layout.camera_field, layout.projector_field, layout.size], np.int64
-    )
+    at = layout.starts
     model = state.rig, state.R_board, state.t_board, state.heights, state.offsets
     order = _sort_by_cell(state, data)
     with ThreadPoolExecutor(len(shares)) as threads:
@@ -197,54 +215,83 @@ def _accumulate(rig, R, t, heights, offsets, data, feature_r, sample_r, feature_
 
     Samples are taken in ``order`` (m,); those in the same cells of both fields are summed before they are added to A.
     """
-    work = allocate_workspace()
-    row, by_field, cells = np.zeros((2, ROW)), np.zeros((2, 2)), np.zeros(4, np.int64)
-    rows, w, r = np.zeros((4, ROW)), np.zeros(4), np.zeros(4)  # of two observations, added at once
-    S, s = np.zeros((ROW, ROW)), np.zeros(ROW)
-    columns = np.zeros(ROW, np.int64)  # of a row's entries, in the order of the vector
+    work, row = allocate_workspace(), np.zeros((2, ROW))
+    sums = Sums(
+        np.zeros((4, ROW)), np.zeros(4), np.zeros(4), np.zeros((ROW, ROW)), np.zeros(ROW), dense_columns(at)
+    )  # fmt: skip
+    for i in poses:
+        for c in range(HEIGHT):
+            sums.columns[c] = 6 * i + c
+        _add_features(rig, R[i], t[i], heights, offsets, data, i, feature_r, feature_w, at, work, row, sums, A, b)
+        part = order[data.sample_from[i] : data.sample_from[i + 1]]
+        _add_samples(rig, R[i], t[i], heights, data, part, sample_r, sample_w, at, work, row, sums, A, b)
+
+
+@kernel()
+def _add_features(rig, R, t, heights, offsets, data, pose, residuals, weights, at, work, row, sums, A, b):
+    """Add the features of one ``pose``, whose ``residuals`` and ``weights`` are (n, 2), to A and b."""
+    for n in range(data.feature_from[pose], data.feature_from[pose + 1]):
+        if weights[n, 0] > 0.0 or weights[n, 1] > 0.0:
+            f = data.feature[n]
+            _, _, i, j = feature_row(rig, R, t, heights, data.frame, data.points[f], offsets[f], work, row)
+            set_feature_columns(sums.columns, rig, f, i, j, at)
+            fill_feature_fields(row, work)
+            _set_rows(sums, 0, row, weights[n], residuals[n])
+            _add_rows(sums, PROJECTOR_FIELD)
+            _move_sums(sums, PROJECTOR_FIELD, A, b)
+
+
+@kernel()
+def _add_samples(rig, R, t, heights, data, part, residuals, weights, at, work, row, sums, A, b):
+    """Add the samples of one pose, whose indices are ``part`` (k,), to A and b."""
+    by_field, cells = np.zeros((2, 2)), np.full(4, -1)
+    first = 0
+    for n in part:
+        if weights[n, 0] > 0.0 or weights[n, 1] > 0.0:
+            u, v = data.sample_px[n]
+            _, _, ci, cj, pi, pj = sample_row(rig, R, t, heights, data.frame, u, v, work, row, by_field)
+            if ci != cells[0] or cj != cells[1] or pi != cells[2] or pj != cells[3]:
+                _add_rows(sums, ROW)
+                _move_sums(sums, ROW, A, b)
+                first = 0
+                cells[0], cells[1], cells[2], cells[3] = ci, cj, pi, pj
+                set_sample_columns(sums.columns, rig, cells, at)
+            fill_sample_fields(row, work, by_field)
+            _set_rows(sums, first, row, weights[n], residuals[n])
+            if first == 2:
+                _add_rows(sums, ROW)
+            first = 2 - first
+    _add_rows(sums, ROW)
+    _move_sums(sums, ROW, A, b)
+
+
+@kernel()
+def dense_columns(at):
+    """Return the columns (ROW,) of a row's entries in the vector of unknowns, of height and rig; the others are 0.
+
+    ``at``: first columns of height, offsets, rig, camera's field, and projector's field.
+    """
+    columns = np.zeros(ROW, np.int64)
     for c in range(HEIGHT_TERMS):
         columns[HEIGHT + c] = at[0] + c
     for c in range(RIG):
         columns[CAMERA + c] = at[2] + c
-    for i in poses:
-        for c in range(HEIGHT):
-            columns[c] = 6 * i + c
-        for n in range(data.feature_from[i], data.feature_from[i + 1]):
-            if feature_w[n, 0] > 0.0 or feature_w[n, 1] > 0.0:
-                f = data.feature[n]
-                _, _, ci, cj = feature_row(rig, R[i], t[i], heights, data.frame, data.points[f], offsets[f], work, row)
-                columns[OFFSET], columns[OFFSET + 1] = at[1] + 2 * f, at[1] + 2 * f + 1
-                _set_field_columns(columns, CAMERA_FIELD, rig.camera, ci, cj, at[3])
-                for k in range(2):  # u's coefficients are in row u alone, v's in row v
-                    _fill_field(row, CAMERA_FIELD + k * FIELD, work.camera_basis, 1.0 - k, float(k))
-                _set_rows(rows, w, r, 0, row, feature_w[n], feature_r[n])
-                _add_rows(S, s, rows, w, r, PROJECTOR_FIELD)
-                _move_sums(S, s, columns, PROJECTOR_FIELD, A, b)
-        columns[OFFSET], columns[OFFSET + 1] = at[1], at[1] + 1  # a sample's row has zeros there
-        cells[:] = -1
-        first = 0
-        for n in order[data.sample_from[i] : data.sample_from[i + 1]]:
-            if sample_w[n, 0] > 0.0 or sample_w[n, 1] > 0.0:
-                px = data.sample_px[n]
-                _, _, ci, cj, pi, pj = sample_row(
-                    rig, R[i], t[i], heights, data.frame, px[0], px[1], work, row, by_field
-                )
-                if ci != cells[0] or cj != cells[1] or pi != cells[2] or pj != cells[3]:
-                    _add_rows(S, s, rows, w, r, ROW)
-                    _move_sums(S, s, columns, ROW, A, b)
-                    first = 0
-                    cells[0], cells[1], cells[2], cells[3] = ci, cj, pi, pj
-                    _set_field_columns(columns, CAMERA_FIELD, rig.camera, ci, cj, at[3])
-                    _set_field_columns(columns, PROJECTOR_FIELD, rig.projector, pi, pj, at[4])
-                for k in range(2):  # both rows look through the camera's field
-                    _fill_field(row, CAMERA_FIELD + k * FIELD, work.camera_basis, by_field[0, k], by_field[1, k])
-                    _fill_field(row, PROJECTOR_FIELD + k * FIELD, work.projector_basis, 1.0 - k, float(k))
-                _set_rows(rows, w, r, first, row, sample_w[n], sample_r[n])
-                if first == 2:
-                    _add_rows(S, s, rows, w, r, ROW)
-                first = 2 - first
-        _add_rows(S, s, rows, w, r, ROW)
-        _move_sums(S, s, columns, ROW, A, b)
+    return columns
+
+
+@kernel()
+def set_feature_columns(columns, rig, feature, i, j, at):
+    """Fill in the columns of a feature's offset, and of the camera's field in the cell (i, j)."""
+    columns[OFFSET], columns[OFFSET + 1] = at[1] + 2 * feature, at[1] + 2 * feature + 1
+    _set_field_columns(columns, CAMERA_FIELD, rig.camera, i, j, at[3])
+
+
+@kernel()
+def set_sample_columns(columns, rig, cells, at):
+    """Fill in the columns of the fields in their ``cells`` (i, j of the camera, i, j of the projector)."""
+    columns[OFFSET], columns[OFFSET + 1] = at[1], at[1] + 1  # a sample's row has zeros there
+    _set_field_columns(columns, CAMERA_FIELD, rig.camera, cells[0], cells[1], at[3])
+    _set_field_columns(columns, PROJECTOR_FIELD, rig.projector, cells[2], cells[3], at[4])
 
 
 @kernel()
@@ -259,6 +306,21 @@ def _set_field_columns(columns, first, device, i, j, start):
 
 
 @kernel()
+def fill_feature_fields(row, work):
+    """Fill in the derivatives of a feature by the camera's field; u's coefficients are in row u alone, v's in row v."""
+    for k in range(2):
+        _fill_field(row, CAMERA_FIELD + k * FIELD, work.camera_basis, 1.0 - k, float(k))
+
+
+@kernel()
+def fill_sample_fields(row, work, by_field):
+    """Fill in the derivatives of a sample by both fields; both rows look through the camera's."""
+    for k in range(2):
+        _fill_field(row, CAMERA_FIELD + k * FIELD, work.camera_basis, by_field[0, k], by_field[1, k])
+        _fill_field(row, PROJECTOR_FIELD + k * FIELD, work.projector_basis, 1.0 - k, float(k))
+
+
+@kernel()
 def _fill_field(row, first, basis, by_u, by_v):
     """Fill in the derivatives of u and v by one component's coefficients; ``by_u``, ``by_v``: by its displacement."""
     for m in range(4):
@@ -269,20 +331,21 @@ def _fill_field(row, first, basis, by_u, by_v):
 
 
 @kernel()
-def _set_rows(rows, w, r, first, row, weight, residual):
+def _set_rows(sums, first, row, weight, residual):
     """Fill in rows ``first`` and ``first`` + 1 with the two of an observation, their weights and residuals."""
     for k in range(2):
-        rows[first + k] = row[k]
-        w[first + k] = weight[k]
-        r[first + k] = residual[k] if weight[k] > 0.0 else 0.0
+        sums.rows[first + k] = row[k]
+        sums.w[first + k] = weight[k]
+        sums.r[first + k] = residual[k] if weight[k] > 0.0 else 0.0
 
 
 @kernel(fastmath=True)
-def _add_rows(S, s, rows, w, r, length):
+def _add_rows(sums, length):
     """Add the weighted products of four rows with themselves to S (upper triangle), and with the residuals to s.
 
     Then the weights are set to zero.
     """
+    rows, w, r, S, s = sums.rows, sums.w, sums.r, sums.S, sums.s
     for a in range(length):
         p0, p1, p2, p3 = w[0] * rows[0, a], w[1] * rows[1, a], w[2] * rows[2, a], w[3] * rows[3, a]
         s[a] += p0 * r[0] + p1 * r[1] + p2 * r[2] + p3 * r[3]
@@ -294,8 +357,9 @@ def _add_rows(S, s, rows, w, r, length):
 
 
 @kernel()
-def _move_sums(S, s, columns, length, A, b):
+def _move_sums(sums, length, A, b):
     """Add S (upper triangle) and s to A and b, each entry to its column, and set them to zero."""
+    S, s, columns = sums.S, sums.s, sums.columns
     for a in range(length):
         target, source, column = A[columns[a]], S[a, a:length], columns[a:length]
         b[columns[a]] += s[a]

@@ -3,7 +3,7 @@
 import numpy as np
 import scipy.sparse as sp
 
-from slviewer.calibration.splined.residuals import project_to_device, undistort_ray
+from slviewer.calibration.splined.residuals import fill_cross, project_to_device, undistort_ray
 from slviewer.calibration.splined.unknowns import LENS, RIG, State
 from slviewer.errors import InputError
 from slviewer.fringe.sequence import Axis
@@ -36,7 +36,7 @@ def _fill_rows(rig, row, pixels, depths, starts, values, columns):
     basis, other = np.zeros((4, 4)), np.zeros((4, 4))
     by_point, by_lens = np.zeros((2, 3)), np.zeros((2, 9))
     ray_by_lens, ray_by_field = np.zeros((2, 9)), np.zeros((2, 2))
-    X, V, m = np.zeros(3), np.zeros(3), np.zeros(3)
+    X, V, m, by_turn = np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3)
     stride, across = rig.camera.coefficients.shape[2], rig.projector.coefficients.shape[2]
     knots, others = stride * rig.camera.coefficients.shape[1], across * rig.projector.coefficients.shape[1]
     for n in range(depths.shape[0]):
@@ -61,10 +61,9 @@ def _fill_rows(rig, row, pixels, depths, starts, values, columns):
             dz = per_z * z * (m[0] * dx + m[1] * dy)
             values[n, 0, c], values[n, 1, c], values[n, 2, c] = x * dz + z * dx, y * dz + z * dy, dz
             _depth_direction(values[n], LENS + c, x, y, per_z * by_lens[row, c])
-        _depth_direction(values[n], 2 * LENS, x, y, per_z * (p[2] * V[1] - p[1] * V[2]))
-        _depth_direction(values[n], 2 * LENS + 1, x, y, per_z * (p[0] * V[2] - p[2] * V[0]))
-        _depth_direction(values[n], 2 * LENS + 2, x, y, per_z * (p[1] * V[0] - p[0] * V[1]))
+        fill_cross(V, p, per_z, by_turn)
         for a in range(3):
+            _depth_direction(values[n], 2 * LENS + a, x, y, by_turn[a])
             _depth_direction(values[n], 2 * LENS + 3 + a, x, y, per_z * p[a])
         for a in range(4):
             for b in range(4):

@@ -18,10 +18,14 @@ POSE_SIGMA = np.array([1.0, 1.0, 1.0, 1e3, 1e3, 1e3])
 @dataclass(frozen=True, eq=False)
 class Prior:
     """Normal distributions: of the fields' coefficients by their roughness (``forms``, times a strength), of the
-    board's height and offsets by what boards are like, and of the poses widely."""
+    board's height and offsets by what boards are like, and of the poses widely.
+
+    ``features_per_point``: how many of the board's features each offset of the state represents.
+    """
 
     forms: tuple[np.ndarray, np.ndarray]
     gauge: np.ndarray
+    features_per_point: float = 1.0
 
     @classmethod
     def build(cls, state: State, data: PoseData) -> "Prior":
@@ -37,7 +41,10 @@ class Prior:
         height, offsets = diagonal[at.height : at.offsets], slice(at.offsets, at.rig)
         A[height, height] += HEIGHT_SIGMA_MM**-2.0
         b[height] -= state.heights / HEIGHT_SIGMA_MM**2
-        form = np.eye(at.rig - at.offsets) / OFFSET_SIGMA_MM**2 + self.gauge.T @ self.gauge / GAUGE_MM**2
+        form = (
+            np.eye(at.rig - at.offsets) * self.features_per_point / OFFSET_SIGMA_MM**2
+            + self.gauge.T @ self.gauge / GAUGE_MM**2
+        )
         A[offsets, offsets] += form
         b[offsets] -= form @ state.offsets.ravel()
         for first, field, form, strength in self._fields(state, strengths):

@@ -6,10 +6,9 @@ from itertools import pairwise
 
 import numpy as np
 
-from slviewer.calibration.splined.normal import PoseData
+from slviewer.calibration.splined.normal import ObservedValues, PoseData
+from slviewer.geometry.robust import tukey_weights
 
-TUKEY_SIGMAS = 4.685
-"""Sigmas beyond which an observation has no weight: 95 % efficient on normal residuals."""
 MIN_SIGMA_PX = 1e-4
 MAX_RATIO = 100.0
 """Largest ratio of residuals to their predicted noise for which their difference is estimated."""
@@ -77,24 +76,19 @@ def pose_sigmas(features: np.ndarray, feature_from: np.ndarray, noise: Noise) ->
     return sigma
 
 
-def robust_weights(
-    features: np.ndarray, samples: np.ndarray, sigmas: tuple[np.ndarray, np.ndarray]
-) -> tuple[np.ndarray, np.ndarray]:
+def robust_weights(features: np.ndarray, samples: np.ndarray, sigmas: ObservedValues) -> ObservedValues:
     """Return the weights of features (n, 2) and samples (m, 2) in 1/px^2: inverse variance times Tukey's biweight.
 
     The biweight is the product of both coordinates'. ``sigmas``: (n, 2) and (m, 2) px. Residuals with NaN weigh 0.
     """
     weights = []
     for r, s in zip((features, samples), sigmas, strict=True):
-        scaled = np.minimum(np.abs(np.nan_to_num(r / s, nan=0.0)) / TUKEY_SIGMAS, 1.0)
-        trust = np.prod((1.0 - scaled**2) ** 2, axis=1, keepdims=True)
+        trust = np.prod(tukey_weights(np.nan_to_num(r / s), 1.0), axis=1, keepdims=True)
         weights.append(np.where(np.isfinite(r / s), trust / s**2, 0.0))
     return weights[0], weights[1]
 
 
-def pose_trust(
-    weights: tuple[np.ndarray, np.ndarray], sigmas: tuple[np.ndarray, np.ndarray], data: PoseData
-) -> np.ndarray:
+def pose_trust(weights: ObservedValues, sigmas: ObservedValues, data: PoseData) -> np.ndarray:
     """Return the mean of Tukey's biweight over each pose's features and over its samples, (poses, 2)."""
     trust = []
     for w, s, start in zip(weights, sigmas, (data.feature_from, data.sample_from), strict=True):

@@ -17,6 +17,31 @@ POSE, HEIGHT, OFFSET, CAMERA, PROJECTOR, TURN, SHIFT, DENSE = 0, 6, 18, 20, 29, 
 
 
 @kernel()
+def _fill_pixel_by_lens(x, y, xd, yd, k, by_lens):
+    """Fill ``by_lens`` (2, 9) with the derivatives of a pixel, before its displacement, by the lens's numbers ``k``.
+
+    (x, y): the undistorted normalised point; (xd, yd): the distorted one.
+    """
+    r2 = x * x + y * y
+    by_lens[:, :4] = 0.0
+    by_lens[0, 0], by_lens[1, 1], by_lens[0, 2], by_lens[1, 3] = xd, yd, 1.0, 1.0
+    power = r2
+    for c in (4, 5, 8):
+        by_lens[0, c], by_lens[1, c] = k[0] * x * power, k[1] * y * power
+        power *= r2
+    by_lens[0, 6], by_lens[1, 6] = k[0] * 2.0 * x * y, k[1] * (r2 + 2.0 * y * y)
+    by_lens[0, 7], by_lens[1, 7] = k[0] * (r2 + 2.0 * x * x), k[1] * 2.0 * x * y
+
+
+@kernel()
+def fill_cross(a, b, scale, out):
+    """Fill ``out`` (3,) with the cross product of a and b (3,), times ``scale``."""
+    out[0] = scale * (a[1] * b[2] - a[2] * b[1])
+    out[1] = scale * (a[2] * b[0] - a[0] * b[2])
+    out[2] = scale * (a[0] * b[1] - a[1] * b[0])
+
+
+@kernel()
 def project_to_device(device, X, basis, by_point, by_lens):
     """(u, v, first column, first row of the field's cell) of a point X (3,) in the device's frame.
 
@@ -30,19 +55,8 @@ def project_to_device(device, X, basis, by_point, by_lens):
     xd, yd, dxx, dxy, dyy = distort_point(x, y, k)
     u, v = k[0] * xd + k[2], k[1] * yd + k[3]
     du, dv, duu, duv, dvu, dvv, i, j = displacement(device, u, v, basis)
-    r2 = x * x + y * y
-    # d(u, v before displacement) by x, y; and by the lens's numbers
-    ux, uy, vx, vy = k[0] * dxx, k[0] * dxy, k[1] * dxy, k[1] * dyy
-    for c in range(9):
-        by_lens[0, c] = 0.0
-        by_lens[1, c] = 0.0
-    by_lens[0, 0], by_lens[1, 1], by_lens[0, 2], by_lens[1, 3] = xd, yd, 1.0, 1.0
-    power = r2
-    for c in (4, 5, 8):
-        by_lens[0, c], by_lens[1, c] = k[0] * x * power, k[1] * y * power
-        power *= r2
-    by_lens[0, 6], by_lens[1, 6] = k[0] * 2.0 * x * y, k[1] * (r2 + 2.0 * y * y)
-    by_lens[0, 7], by_lens[1, 7] = k[0] * (r2 + 2.0 * x * x), k[1] * 2.0 * x * y
+    _fill_pixel_by_lens(x, y, xd, yd, k, by_lens)
+    ux, uy, vx, vy = k[0] * dxx, k[0] * dxy, k[1] * dxy, k[1] * dyy  # d(u, v before displacement) by x, y
     by_point[0, 0], by_point[0, 1] = ux * inverse, uy * inverse
     by_point[1, 0], by_point[1, 1] = vx * inverse, vy * inverse
     by_point[0, 2] = -(ux * x + uy * y) * inverse
@@ -71,28 +85,9 @@ def undistort_ray(device, u, v, basis, by_lens, by_field):
     _, _, dxx, dxy, dyy = distort_point(x, y, k)
     determinant = dxx * dyy - dxy * dxy
     ixx, ixy, iyy = dyy / determinant, -dxy / determinant, dxx / determinant
-    r2 = x * x + y * y
-    # right-hand sides: d(xd, yd), less d(Brown) by its own coefficients
-    for c in range(9):
-        a = b = 0.0
-        if c == 0:
-            a = -xd / k[0]
-        elif c == 1:
-            b = -yd / k[1]
-        elif c == 2:
-            a = -1.0 / k[0]
-        elif c == 3:
-            b = -1.0 / k[1]
-        elif c == 4:
-            a, b = -x * r2, -y * r2
-        elif c == 5:
-            a, b = -x * r2 * r2, -y * r2 * r2
-        elif c == 6:
-            a, b = -2.0 * x * y, -(r2 + 2.0 * y * y)
-        elif c == 7:
-            a, b = -(r2 + 2.0 * x * x), -2.0 * x * y
-        else:
-            a, b = -x * r2 * r2 * r2, -y * r2 * r2 * r2
+    _fill_pixel_by_lens(x, y, xd, yd, k, by_lens)
+    for c in range(9):  # the point moves so that the pixel stays
+        a, b = -by_lens[0, c] / k[0], -by_lens[1, c] / k[1]
         by_lens[0, c] = ixx * a + ixy * b
         by_lens[1, c] = ixy * a + iyy * b
     # q + W(q) = pixel: dq = -(1 + dW)^-1 dW's coefficients
@@ -125,10 +120,7 @@ def feature_row(rig, R, t, heights, frame, point, offset, work, row):
         return u, v, i, j
     for k in range(2):
         m0, m1, m2 = work.by_point[k, 0], work.by_point[k, 1], work.by_point[k, 2]
-        # a turn w moves the point by w x L
-        row[k, POSE] = m2 * L[1] - m1 * L[2]
-        row[k, POSE + 1] = m0 * L[2] - m2 * L[0]
-        row[k, POSE + 2] = m1 * L[0] - m0 * L[1]
+        fill_cross(L, work.by_point[k], 1.0, row[k, POSE : POSE + 3])  # a turn w moves the point by w x L
         row[k, POSE + 3], row[k, POSE + 4], row[k, POSE + 5] = m0, m1, m2
         along = m0 * R[0, 2] + m1 * R[1, 2] + m2 * R[2, 2]
         for c in range(heights.shape[0]):
@@ -177,17 +169,13 @@ def sample_row(rig, R, t, heights, frame, u, v, work, row, by_field):
         return np.nan, np.nan, ci, cj, pi, pj
     for k in range(2):
         p0, p1, p2 = work.by_point[k, 0], work.by_point[k, 1], work.by_point[k, 2]
-        row[k, TURN] = p2 * V[1] - p1 * V[2]
-        row[k, TURN + 1] = p0 * V[2] - p2 * V[0]
-        row[k, TURN + 2] = p1 * V[0] - p0 * V[1]
+        fill_cross(V, work.by_point[k], 1.0, row[k, TURN : TURN + 3])
         row[k, SHIFT], row[k, SHIFT + 1], row[k, SHIFT + 2] = p0, p1, p2
         m0 = p0 * rig.R[0, 0] + p1 * rig.R[1, 0] + p2 * rig.R[2, 0]
         m1 = p0 * rig.R[0, 1] + p1 * rig.R[1, 1] + p2 * rig.R[2, 1]
         m2 = p0 * rig.R[0, 2] + p1 * rig.R[1, 2] + p2 * rig.R[2, 2]
         along = (m0 * x + m1 * y + m2) / facing
-        row[k, POSE] = along * (Y[1] * N[2] - Y[2] * N[1])
-        row[k, POSE + 1] = along * (Y[2] * N[0] - Y[0] * N[2])
-        row[k, POSE + 2] = along * (Y[0] * N[1] - Y[1] * N[0])
+        fill_cross(Y, N, along, row[k, POSE : POSE + 3])
         row[k, POSE + 3], row[k, POSE + 4], row[k, POSE + 5] = along * N[0], along * N[1], along * N[2]
         for c in range(heights.shape[0]):
             row[k, HEIGHT + c] = along * work.terms[0, c]

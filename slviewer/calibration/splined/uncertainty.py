@@ -21,15 +21,16 @@ from slviewer.calibration.splined.fields import Device
 from slviewer.calibration.splined.volume import (
     BestMotion,
     Volume,
-    depth_axis,
-    is_supported,
+    in_illuminated_cells,
     remove_rigid_motion,
+    select_depth_axis,
     sigma_3d,
     view_pixels,
     working_volume,
 )
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.jit import kernel
+from slviewer.geometry.rigid import Floats
 
 NODES = (21, 16, 11)
 """Nodes of the map across, down, and in depth: interpolation errors stay below 10 to 20 %, and a map takes about a
@@ -86,17 +87,17 @@ def compute_sigma_map(bundle: Bundle, axis: Axis, near: float, far: float) -> Si
     return SigmaMap(np.ascontiguousarray(sigma[tuple(nearest)], np.float32), near, far)
 
 
-def volume_sigmas(bundle: Bundle, axis: Axis, volume: Volume) -> NDArray[np.float64]:
+def volume_sigmas(bundle: Bundle, axis: Axis, volume: Volume) -> Floats:
     """Return the 3D standard deviation (n,) mm of a volume's points, measured through one axis.
 
     The rigid motion of the supported points is removed.
     """
     whitened = bundle.whiten(bundle.point_jacobian(axis, volume.pixels, volume.z))
     sigma = sigma_3d(remove_rigid_motion(whitened, volume.points, _select_fitted(bundle, volume)))
-    return np.asarray(sigma * extrapolation_factor(bundle, volume))
+    return sigma * extrapolation_factor(bundle, volume)
 
 
-def extrapolation_factor(bundle: Bundle, places: Volume) -> NDArray[np.float64]:
+def extrapolation_factor(bundle: Bundle, places: Volume) -> Floats:
     """Return the factors (n,) by which the priors underestimate the standard deviations at ``places``.
 
     1 inside the calibrated region; elsewhere the ``persistence_ratio`` of the field that no pose illuminated there, the
@@ -108,7 +109,7 @@ def extrapolation_factor(bundle: Bundle, places: Volume) -> NDArray[np.float64]:
         (rig.camera, places.pixels, bundle.camera_poses),
         (rig.projector, places.projector, bundle.projector_poses),
     ):
-        supported = is_supported(device, pixels, poses > 0)
+        supported = in_illuminated_cells(device, pixels, poses > 0)
         factor = np.where(supported, factor, np.maximum(factor, persistence_ratio(device, poses > 0)))
     return factor
 
@@ -142,7 +143,7 @@ def summarise_volume_sigma(bundle: Bundle) -> dict[str, Any]:
     """
     rig = bundle.state.rig
     volume = working_volume(rig, bundle.depth_range_mm)
-    axis = depth_axis(rig, volume)
+    axis = select_depth_axis(rig, volume)
     fitted = _select_fitted(bundle, volume)
     sigma = volume_sigmas(bundle, axis, volume)
     worst = int(np.argmax(sigma))

@@ -12,6 +12,7 @@ from slviewer.calibration.splined.fields import Device, no_displacement
 from slviewer.calibration.stereo import StereoModel
 from slviewer.geometry.brown import fold_radius_squared
 from slviewer.geometry.lens import Lens
+from slviewer.geometry.rigid import Floats
 
 LENS = 9
 """fx fy cx cy k1 k2 p1 p2 k3."""
@@ -24,8 +25,8 @@ class Arrangement(NamedTuple):
 
     camera: Device
     projector: Device
-    R: NDArray[np.float64]
-    t: NDArray[np.float64]
+    R: Floats
+    t: Floats
 
 
 @dataclass(frozen=True)
@@ -73,6 +74,11 @@ class UnknownLayout:
         return self.projector_field + 2 * self.projector_knots
 
     @property
+    def starts(self) -> NDArray[np.int64]:
+        """(5,): the first unknown of height, offsets, rig, camera's field, and projector's field, for the kernels."""
+        return np.array([self.height, self.offsets, self.rig, self.camera_field, self.projector_field], np.int64)
+
+    @property
     def separable(self) -> tuple[slice, ...]:
         """Blocks of which no two share an observation or a prior: offsets, and u and v of the projector's field."""
         v = self.projector_field + self.projector_knots
@@ -85,10 +91,10 @@ class State:
     ``offsets`` (f, 2) mm: the board's shape."""
 
     rig: Arrangement
-    R_board: NDArray[np.float64]
-    t_board: NDArray[np.float64]
-    heights: NDArray[np.float64]
-    offsets: NDArray[np.float64]
+    R_board: Floats
+    t_board: Floats
+    heights: Floats
+    offsets: Floats
 
     @classmethod
     def from_stereo(
@@ -118,7 +124,7 @@ class State:
         knots = [device.coefficients[0].size for device in (self.rig.camera, self.rig.projector)]
         return UnknownLayout(len(self.t_board), len(self.offsets), knots[0], knots[1])
 
-    def step(self, step: NDArray[np.float64]) -> "State":
+    def step(self, step: Floats) -> "State":
         """Return the state after a step (N,) in the order of ``layout``; rotation vectors apply from the left."""
         at = self.layout
         pose = step[: at.height].reshape(-1, 6)
@@ -141,15 +147,13 @@ class State:
 
 def pinhole_lens(device: Device) -> Lens:
     """Return the pinhole and Brown lens of a device, without its displacement field."""
-    fx, fy, cx, cy, *D = device.numbers[:LENS]
-    size = int(device.size[0]), int(device.size[1])
-    return Lens(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]), np.array(D), size)
+    return Lens.from_parameters(device.numbers[:LENS], (int(device.size[0]), int(device.size[1])))
 
 
-def rotate_left(R: NDArray[np.float64], vector: NDArray[np.float64]) -> NDArray[np.float64]:
+def rotate_left(R: Floats, vector: Floats) -> Floats:
     """Rotate R (3, 3) from the left by a rotation vector (3,); the result is orthonormalised."""
     u, _, v = np.linalg.svd(cv2.Rodrigues(np.ascontiguousarray(vector))[0] @ R)
-    return np.asarray(u @ v)
+    return u @ v
 
 
 def _step_device(device: Device, numbers: np.ndarray, coefficients: np.ndarray) -> Device:

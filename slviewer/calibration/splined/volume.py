@@ -3,13 +3,14 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from slviewer.calibration.splined.fields import Device, distort_to_pixel, undistort_pixel
+from slviewer.calibration.splined.fields import Device, project_point, undistort_pixel
 from slviewer.calibration.splined.unknowns import Arrangement
 from slviewer.errors import InputError
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.jit import kernel
+from slviewer.geometry.rigid import Floats, motion_jacobian
+from slviewer.geometry.vectors import finite_rows, rms
 
 DEPTH_FACTORS = (0.87, 1.13)
 """Of the nearest and the farthest calibrated depth: in front of them (R1), inside (R2) and behind (R3), as the Letter
@@ -24,16 +25,16 @@ class Volume:
     (n, 2).
     """
 
-    pixels: NDArray[np.float64]
-    z: NDArray[np.float64]
-    points: NDArray[np.float64]
-    projector: NDArray[np.float64]
+    pixels: Floats
+    z: Floats
+    points: Floats
+    projector: Floats
 
     def supported(
         self, rig: Arrangement, camera_illuminated: np.ndarray, projector_illuminated: np.ndarray
     ) -> np.ndarray:
         """(n,) bool: points in cells (rows, columns) bool that target poses illuminated, in both devices."""
-        return is_supported(rig.camera, self.pixels, camera_illuminated) & is_supported(
+        return in_illuminated_cells(rig.camera, self.pixels, camera_illuminated) & in_illuminated_cells(
             rig.projector, self.projector, projector_illuminated
         )
 
@@ -41,19 +42,19 @@ class Volume:
 def working_volume(
     rig: Arrangement,
     calibrated_mm: tuple[float, float],
-    reach: tuple[float, float] = DEPTH_FACTORS,
     columns: int = 9,
     rows: int = 7,
     depths: int = 5,
 ) -> Volume:
     """Return the points of a regular grid over the camera's image and depths that the projector's image contains.
 
-    ``calibrated_mm``: nearest and farthest calibrated depth, multiplied by ``reach``; ``columns``, ``rows``, ``depths``
-    of the grid. Raises InputError for an empty range of depths, and where the projector's image contains no point.
+    ``calibrated_mm``: nearest and farthest calibrated depth, multiplied by ``DEPTH_FACTORS``; ``columns``, ``rows``,
+    ``depths`` of the grid. Raises InputError for an empty range of depths, and where the projector's image contains no
+    point.
     """
-    near, far = reach[0] * calibrated_mm[0], reach[1] * calibrated_mm[1]
+    near, far = (factor * mm for factor, mm in zip(DEPTH_FACTORS, calibrated_mm, strict=True))
     if not 0 < near < far:
-        raise InputError(f"calibrated depths {calibrated_mm} mm and a reach of {reach} leave no volume")
+        raise InputError(f"calibrated depths {calibrated_mm} mm leave no volume")
     width, height = rig.camera.size
     u, v, z = np.meshgrid(
         np.linspace(0, width - 1, columns),
@@ -85,19 +86,19 @@ def view_pixels(rig: Arrangement, pixels: np.ndarray, z: np.ndarray) -> tuple[np
     return points, projector
 
 
-def is_supported(device: Device, pixels: np.ndarray, illuminated: np.ndarray) -> np.ndarray:
+def in_illuminated_cells(device: Device, pixels: np.ndarray, illuminated: np.ndarray) -> np.ndarray:
     """(n,) bool: whether ``pixels`` (n, 2) are in cells (rows, columns) bool that target poses illuminated.
 
     Pixels outside the image count to the cell at its edge; False for NaN.
     """
     shape = np.array([illuminated.shape[1], illuminated.shape[0]])
-    known = np.isfinite(pixels).all(axis=1)
+    known = finite_rows(pixels)
     place = np.where(known[:, None], (pixels + 0.5) / device.size * shape, 0.0)
     cells = np.clip(place, 0, shape - 1).astype(int)
-    return np.asarray(illuminated[cells[:, 1], cells[:, 0]] & known)
+    return illuminated[cells[:, 1], cells[:, 0]] & known
 
 
-def depth_axis(rig: Arrangement, volume: Volume) -> Axis:
+def select_depth_axis(rig: Arrangement, volume: Volume) -> Axis:
     """Return the projector axis whose coordinate changes more with depth, in the median over the volume."""
     _, later = view_pixels(rig, volume.pixels, 1.001 * volume.z)
     across, down = np.nanmedian(np.abs(later - volume.projector), axis=0)
@@ -126,7 +127,7 @@ class BestMotion:
         if np.count_nonzero(chosen) < 3:
             raise InputError(f"{np.count_nonzero(chosen)} points were given: a rigid motion needs three")
         centre = points[chosen].mean(axis=0)
-        arm = max(float(np.sqrt(np.mean((points[chosen] - centre) ** 2))), 1e-12)
+        arm = max(rms(points[chosen] - centre), 1e-12)
         held = _motion_basis(points, centre, arm) * np.repeat(chosen, 3)[:, None]
         return cls(np.linalg.lstsq(held.T @ held, held.T, rcond=None)[0].T, centre, arm)
 
@@ -144,27 +145,19 @@ def remove_rigid_motion(whitened: np.ndarray, points: np.ndarray, fitted: np.nda
     """
     motion = BestMotion.fit(points, fitted)
     weights, moved = motion.weights.astype(whitened.dtype), motion.displace(points).astype(whitened.dtype)
-    return np.asarray(whitened - (whitened @ weights) @ moved.T)
+    return whitened - (whitened @ weights) @ moved.T
 
 
 def sigma_3d(whitened: np.ndarray) -> np.ndarray:
     """Return the 3D standard deviation (n,) mm of each point from a factor (m, 3 n) of the points' covariance."""
     squares = np.einsum("mn,mn->n", whitened, whitened, dtype=np.float64)
-    return np.asarray(np.sqrt(squares.reshape(-1, 3).sum(axis=1)))
+    return np.sqrt(squares.reshape(-1, 3).sum(axis=1))
 
 
 def _motion_basis(points: np.ndarray, centre: np.ndarray, arm: float) -> np.ndarray:
     """Return the displacements (3 n, 6) of points (n, 3) by translations and by rotations about ``centre``."""
-    x, y, z = ((points - centre) / arm).T
-    none, one = np.zeros(len(points)), np.ones(len(points))
-    along = np.array(
-        [
-            [one, none, none, none, z, -y],
-            [none, one, none, -z, none, x],
-            [none, none, one, y, -x, none],
-        ]
-    )
-    return np.asarray(along.transpose(2, 0, 1).reshape(-1, 6))
+    J = motion_jacobian((points - centre) / arm)
+    return J[:, :, [3, 4, 5, 0, 1, 2]].reshape(-1, 6)
 
 
 @kernel()
@@ -175,10 +168,4 @@ def _view_all(rig, pixels, depths, points, projector):
         x, y = undistort_pixel(rig.camera, pixels[n, 0], pixels[n, 1], basis)
         z = depths[n]
         points[n, 0], points[n, 1], points[n, 2] = x * z, y * z, z
-        X0 = z * (rig.R[0, 0] * x + rig.R[0, 1] * y + rig.R[0, 2]) + rig.t[0]
-        X1 = z * (rig.R[1, 0] * x + rig.R[1, 1] * y + rig.R[1, 2]) + rig.t[1]
-        X2 = z * (rig.R[2, 0] * x + rig.R[2, 1] * y + rig.R[2, 2]) + rig.t[2]
-        u = v = np.nan
-        if X2 > 0.0:  # False for NaN
-            u, v = distort_to_pixel(rig.projector, X0 / X2, X1 / X2, basis)
-        projector[n, 0], projector[n, 1] = u, v
+        projector[n, 0], projector[n, 1] = project_point(rig, x, y, z, basis)

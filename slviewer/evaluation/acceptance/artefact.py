@@ -95,45 +95,20 @@ class Artefact:
     def from_dict(cls, given: Mapping[str, Any]) -> "Artefact":
         """Return an artefact from the table of its file. Raises InputError for what is missing, unknown or
         impossible."""
-        for table, known in _KEYS.items():
-            part = given if not table else given.get(table, {})
-            if not isinstance(part, Mapping):
-                raise InputError(f"the artefact's [{table}] is no table: write [{table}] and its values below it")
-            if unknown := set(part) - known:
-                raise InputError(
-                    f"the artefact's file says {sorted(unknown)[0]!r}{f' in [{table}]' if table else ''}, which is "
-                    f"unknown: use {', '.join(sorted(known))}"
-                )
+        _check_keys(given)
         kind = given.get("kind")
         if kind not in tuple(BALLS):  # it may be of any type
             raise InputError(f"the artefact's kind is {kind!r}: use ball-bar, sphere or plane")
-        calibrated, measured, limits = given.get("calibrated", {}), given.get("measured", {}), given.get("limits", {})
+        calibrated, measured, limits = (given.get(table, {}) for table in ("calibrated", "measured", "limits"))
         spacing = None
         if kind == "ball-bar":
             spacing = Length(_number(calibrated, "spacing_mm"), _number(calibrated, "spacing_U_mm", least=0))
-        diameters: tuple[Length, ...] = ()
-        if kind != "plane":
-            U = _number(calibrated, "diameter_U_mm", least=0)
-            each = calibrated.get("diameter_mm")
-            listed = each if isinstance(each, list) else [each] * BALLS[kind]
-            diameters = tuple(Length(_number({"diameter_mm": d}, "diameter_mm"), U) for d in listed)
-            if len(diameters) != BALLS[kind]:
-                raise InputError(f"{len(diameters)} diameters are given for {BALLS[kind]}: give one a ball")
-        captures = measured.get("captures")
-        if isinstance(captures, list):
-            captures = {str(name): name for name in captures}  # any values: they are checked next
-        if not isinstance(captures, Mapping) or not captures or not all(isinstance(c, str) for c in captures.values()):
-            raise InputError(
-                'the artefact\'s file names no captures: in [measured] write captures = ["bar_*"], or a table '
-                "[measured.captures] of position = capture"
-            )
-        allowed = {key: _number(limits, key) for key in limits}
         return cls(
             kind=kind,
             name=str(given.get("name", kind)),
             certificate=str(given.get("certificate", "none given")),
             spacing=spacing,
-            diameters=diameters,
+            diameters=_read_diameters(calibrated, BALLS[kind]),
             form=Length(_number(calibrated, "form_mm", 0.0, 0), _number(calibrated, "form_U_mm", 0.0, 0)),
             reference_celsius=_number(calibrated, "temperature_C", 20.0, -50),
             expansion=Expansion(
@@ -142,9 +117,46 @@ class Artefact:
             temperature=Temperature(
                 _number(measured, "temperature_C", least=-50), _number(measured, "temperature_U_K", least=0)
             ),
-            positions={str(position): capture for position, capture in captures.items()},
-            limits=Limits(**allowed),
+            positions=_read_positions(measured.get("captures")),
+            limits=Limits(**{key: _number(limits, key) for key in limits}),
         )
+
+
+def _check_keys(given: Mapping[str, Any]) -> None:
+    """Raise InputError for a table of the artefact's file that is none, and for a key that is not in `_KEYS`."""
+    for table, known in _KEYS.items():
+        part = given if not table else given.get(table, {})
+        if not isinstance(part, Mapping):
+            raise InputError(f"the artefact's [{table}] must be a table: write [{table}] and its values below it")
+        if unknown := set(part) - known:
+            raise InputError(
+                f"the artefact's file says {sorted(unknown)[0]!r}{f' in [{table}]' if table else ''}, which is "
+                f"unknown: use {', '.join(sorted(known))}"
+            )
+
+
+def _read_diameters(calibrated: Mapping[str, Any], balls: int) -> tuple[Length, ...]:
+    """Return the diameter of each of so many balls, from one number or a list."""
+    if not balls:
+        return ()
+    U = _number(calibrated, "diameter_U_mm", least=0)
+    each = calibrated.get("diameter_mm")
+    listed = each if isinstance(each, list) else [each] * balls
+    if len(listed) != balls:
+        raise InputError(f"{len(listed)} diameters are given for {balls}: give one a ball")
+    return tuple(Length(_number({"diameter_mm": d}, "diameter_mm"), U) for d in listed)
+
+
+def _read_positions(captures: object) -> dict[str, str]:
+    """Return {position: capture} from a list of captures or a table."""
+    if isinstance(captures, list):
+        captures = {str(name): name for name in captures}  # any values: they are checked next
+    if not isinstance(captures, Mapping) or not captures or not all(isinstance(c, str) for c in captures.values()):
+        raise InputError(
+            'the artefact\'s file names no captures: in [measured] write captures = ["bar_*"], or a table '
+            "[measured.captures] of position = capture"
+        )
+    return {str(position): capture for position, capture in captures.items()}
 
 
 def _number(table: Mapping[str, Any], key: str, otherwise: float | None = None, least: float | None = None) -> float:

@@ -72,7 +72,7 @@ class Judgement:
     decision: Decision | None
 
 
-def judge(name: str, figures: Sequence[AcceptanceFigure], limit_mm: float | None) -> Judgement:
+def judge_property(name: str, figures: Sequence[AcceptanceFigure], limit_mm: float | None) -> Judgement:
     """The decision on one property from its figures at all positions."""
     mine = [figure for figure in figures if figure.property == name]
     worst = max(mine, key=lambda figure: abs(figure.error_mm) + figure.U_mm)

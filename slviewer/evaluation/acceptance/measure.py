@@ -10,6 +10,7 @@ from slviewer.evaluation.acceptance.figures import AcceptanceFigure
 from slviewer.evaluation.incidence import incidence
 from slviewer.evaluation.plane import PlaneResult, evaluate_plane
 from slviewer.evaluation.sphere import SphereResult, evaluate_spheres
+from slviewer.geometry.vectors import unit_vectors
 from slviewer.reconstruction.cloud import Cloud
 
 FORM, SIZE, SPACING, FLATNESS = "probing error of form", "probing error of size", "sphere-spacing error", "flatness"
@@ -34,12 +35,17 @@ class Position:
     incidence: dict[str, float] | None
     warnings: tuple[str, ...]
 
+    @property
+    def properties(self) -> set[str]:
+        """Names of the properties that were measured here."""
+        return {figure.property for figure in self.figures}
+
     def error(self, name: str) -> AcceptanceFigure:
         """The worst figure of a property at this position."""
         return max((f for f in self.figures if f.property == name), key=lambda f: abs(f.error_mm))
 
 
-def measure(
+def measure_artefact(
     artefact: Artefact,
     cloud: Cloud,
     position: str,
@@ -102,6 +108,5 @@ def _measure_balls(
 def _fit_covariance(points: np.ndarray, ball: SphereResult) -> np.ndarray:
     """(4, 4) mm^2 of centre and radius, from the scatter of the points about the sphere."""
     offsets = points[ball.inliers].astype(np.float64) - ball.sphere.centre
-    J = np.column_stack([offsets / np.linalg.norm(offsets, axis=1)[:, None], np.ones(len(offsets))])
-    covariance: np.ndarray = ball.rms_mm**2 * np.linalg.inv(J.T @ J)
-    return covariance
+    J = np.column_stack([unit_vectors(offsets), np.ones(len(offsets))])
+    return ball.rms_mm**2 * np.linalg.inv(J.T @ J)

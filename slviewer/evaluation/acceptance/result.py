@@ -9,7 +9,7 @@ from scipy.special import stdtrit
 
 from slviewer.errors import InputError
 from slviewer.evaluation.acceptance.artefact import Artefact
-from slviewer.evaluation.acceptance.figures import K_95, K_997, RULE, Decision, Judgement, judge
+from slviewer.evaluation.acceptance.figures import K_95, K_997, RULE, Decision, Judgement, judge_property
 from slviewer.evaluation.acceptance.measure import FLATNESS, FORM, SIZE, SPACING, Position
 from slviewer.evaluation.render import Row, render
 from slviewer.records.plain import to_plain
@@ -87,18 +87,15 @@ class Acceptance:
             row: Row = {"position": position.position}
             if position.incidence:
                 row["R1/R2/R3 %"] = "/".join(f"{share:.0f}" for share in position.incidence.values())
-            if self.artefact.kind == "plane":
-                flat = position.error(FLATNESS)
-                row |= {"flatness (95 %)": flat.within_95_mm[1], "flatness (99.7 %)": flat.within_997_mm[1]}
-            else:
-                form, size = position.error(FORM), position.error(SIZE)
-                row |= {"form (95 %)": form.within_95_mm[1], "form (99.7 %)": form.within_997_mm[1]}
-                row |= {"size error": size.error_mm, "size +- (95 %)": _half_width(size.within_95_mm)}
-                row["size +- (99.7 %)"] = _half_width(size.within_997_mm)
-                if self.artefact.spacing is not None:
-                    spacing = position.error(SPACING)
-                    row |= {"spacing error": spacing.error_mm, "spacing +- (95 %)": _half_width(spacing.within_95_mm)}
-                    row["spacing +- (99.7 %)"] = _half_width(spacing.within_997_mm)
+            for title, name in (("flatness", FLATNESS), ("form", FORM)):
+                if name in position.properties:
+                    worst = position.error(name)
+                    row |= {f"{title} (95 %)": worst.within_95_mm[1], f"{title} (99.7 %)": worst.within_997_mm[1]}
+            for title, name in (("size", SIZE), ("spacing", SPACING)):
+                if name in position.properties:
+                    worst = position.error(name)
+                    row |= {f"{title} error": worst.error_mm, f"{title} +- (95 %)": _half_width(worst.within_95_mm)}
+                    row[f"{title} +- (99.7 %)"] = _half_width(worst.within_997_mm)
             row |= {"RMS": max(position.rms_mm), "noise floor": max(position.floor_mm), "points": position.points}
             table.append(row)
         return table
@@ -150,7 +147,7 @@ def conclude_test(artefact: Artefact, model: str, positions: Sequence[Position])
     limits = artefact.limits
     allowed = {FORM: limits.form_mm, SIZE: limits.size_mm, SPACING: limits.spacing_mm, FLATNESS: limits.flatness_mm}
     present = {figure.property for figure in figures}
-    judgements = tuple(judge(name, figures, limit) for name, limit in allowed.items() if name in present)
+    judgements = tuple(judge_property(name, figures, limit) for name, limit in allowed.items() if name in present)
     return Acceptance(artefact, model, tuple(positions), judgements, _estimate_scale(artefact, positions))
 
 

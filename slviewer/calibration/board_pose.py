@@ -1,0 +1,50 @@
+"""The pose of a board, and the lens of a device, from pixels of the board's features; by OpenCV."""
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+
+from slviewer.errors import CalibrationRejected
+from slviewer.geometry.rigid import Floats, transform_from_rvec
+
+ITERATIONS = 200
+CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, ITERATIONS, 1e-9)
+"""Where OpenCV's calibrations end."""
+
+
+def solve_pose(
+    points: np.ndarray, pixels: np.ndarray, K: np.ndarray, D: np.ndarray, flags: int = cv2.SOLVEPNP_ITERATIVE
+) -> Floats | None:
+    """Solve T_camera_board (4, 4) mm from points (n, 3) mm and pixels (n, 2); None without a finite solution.
+
+    ``K`` and ``D``: of the lens, as OpenCV has them; ``flags``: OpenCV's method.
+    """
+    try:
+        success, rvec, tvec = cv2.solvePnP(np.asarray(points, float), np.asarray(pixels, float), K, D, flags=flags)
+    except cv2.error:
+        return None
+    T = transform_from_rvec(rvec, tvec) if success else np.full((4, 4), np.nan)
+    return T if np.isfinite(T).all() else None
+
+
+def solve_device(
+    device: str, points: Sequence[np.ndarray], pixels: Sequence[np.ndarray], size: tuple[int, int]
+) -> tuple[np.ndarray, np.ndarray, list[Floats], tuple[float, float]]:
+    """Solve a pinhole and Brown lens from points (n, 3) mm and pixels (n, 2) of each pose, float32.
+
+    Returns K (3, 3), D (5,), T_device_board (4, 4) mm of each pose, and the standard deviations of fx and fy in px.
+    ``device``: for the message of CalibrationRejected, which is raised where OpenCV finds no solution.
+    """
+    try:
+        _, K, D, rvecs, tvecs, deviations, _, _ = cv2.calibrateCameraExtended(
+            points, pixels, size, np.zeros((3, 3)), np.zeros(5), criteria=CRITERIA
+        )
+    except cv2.error as error:
+        raise CalibrationRejected(
+            f"the {device}'s lens could not be solved from {len(points)} poses: "
+            f"capture the board in more positions and tilts ({error.err})"
+        ) from error
+    poses = [transform_from_rvec(rvec, tvec) for rvec, tvec in zip(rvecs, tvecs, strict=True)]
+    fx, fy = deviations.ravel()[:2].tolist()
+    return K, D.ravel()[:5], poses, (fx, fy)

@@ -1,0 +1,42 @@
+"""Lengths, directions and means of many vectors."""
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+
+def lengths(vectors: np.ndarray) -> np.ndarray:
+    """Return the lengths (...) of vectors (..., k)."""
+    return np.linalg.norm(vectors, axis=-1)
+
+
+def unit_vectors(vectors: np.ndarray) -> np.ndarray:
+    """Return vectors (..., k) of length 1; 0 where a vector is 0."""
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-300)
+
+
+def diagonal(points: np.ndarray) -> float:
+    """Return the length of the diagonal of the box around points (n, k)."""
+    return float(np.linalg.norm(np.ptp(points, axis=0)))
+
+
+def box_middle(points: np.ndarray) -> np.ndarray:
+    """Return the middle (k,) of the box around points (n, k)."""
+    return (points.min(axis=0) + points.max(axis=0)) / 2
+
+
+def rms(values: ArrayLike) -> float:
+    """Return the root mean square of values."""
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def rms_length(vectors: np.ndarray) -> float:
+    """Return the root mean square length of vectors (n, k); rows with NaN do not count."""
+    return float(np.sqrt(np.nanmean(np.sum(vectors**2, axis=1))))
+
+
+def finite_rows(*arrays: np.ndarray) -> np.ndarray:
+    """Return where (...) all values along the last axis of every array (..., k) are finite."""
+    first, *others = (np.isfinite(each).all(axis=-1) for each in arrays)
+    for other in others:
+        first &= other
+    return first
