@@ -3,13 +3,13 @@
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property, lru_cache, partial
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
 from slviewer.fringe.line_sample import LineSample
 from slviewer.fringe.residual_sample import cosine_columns
-from slviewer.fringe.sequence import Axis, Kind, PatternSequence
+from slviewer.fringe.sequence import Axis, PatternSequence
 
 Result = TypeVar("Result")
 
@@ -61,23 +61,17 @@ class AxisFrames:
         return self.cell_px * 2.0 ** (len(self.bits) - self.complementary - count)
 
 
-def described_frames(
-    sequence: PatternSequence, axis: Axis, images: Sequence[int | None] | None = None
-) -> AxisFrames:  # fmt: skip
+def described_frames(sequence: PatternSequence, axis: Axis, images: Sequence[int | None] | None = None) -> AxisFrames:
     """Return the frames of an axis as a sequence describes them, frame i being shown in image ``images[i]``.
 
     ``images``: None where an image is missing; frame i is image i if no images are given.
     """
 
-    def list_images(steps: Iterable[int]) -> tuple[int | None, ...]:
+    def list_images(frames: Iterable[int]) -> tuple[int | None, ...]:
         """Return the image of each frame; None for a missing one."""
-        return tuple(i if images is None else images[i] for i in steps)
+        return tuple(i if images is None else images[i] for i in frames)
 
-    def list_images_of_kind(kind: Kind) -> tuple[int | None, ...]:
-        """Return the images of the frames of one kind, sorted by bit."""
-        return list_images(sorted(sequence.find(kind, axis), key=lambda i: sequence.frames[i].bit))
-
-    complementary = list_images_of_kind("complementary")
+    complementary = list_images(sequence.bits("complementary", axis))
     return AxisFrames(
         extent=sequence.extent(axis) if sequence.projector_size else None,
         sign=sequence.sign(axis),
@@ -85,8 +79,8 @@ def described_frames(
         origin_px=sequence.origin_px(axis),
         cell_px=sequence.gray_cell(axis),
         shifts=tuple((period, list_images(steps)) for period, steps in sequence.phase_shifts(axis)),
-        bits=list_images_of_kind("gray") + complementary,
-        inverse=list_images_of_kind("inverse"),
+        bits=list_images(sequence.bits("gray", axis)) + complementary,
+        inverse=list_images(sequence.bits("inverse", axis)),
         complementary=bool(complementary),
     )
 
@@ -98,9 +92,20 @@ def reversed_bits(frames: AxisFrames, with_complementary: bool = False) -> AxisF
     """
     if with_complementary:
         return replace(frames, bits=frames.bits[::-1])
-    last = frames.bits[len(frames.bits) - frames.complementary :]
-    gray = frames.bits[: len(frames.bits) - frames.complementary]
-    return replace(frames, bits=(*gray[::-1], *last), inverse=frames.inverse[::-1])
+    count = len(frames.bits) - frames.complementary
+    return replace(frames, bits=frames.bits[:count][::-1] + frames.bits[count:], inverse=frames.inverse[::-1])
+
+
+class BitReading(NamedTuple):
+    """Bit as it is read from its images.
+
+    ``value`` and ``decided`` (p,) bool; ``share`` of decided pixels; ``stripe_px``: mean width of the stripes.
+    """
+
+    value: np.ndarray
+    decided: np.ndarray
+    share: float
+    stripe_px: float
 
 
 class AxisReader:
@@ -178,11 +183,10 @@ class AxisReader:
         share = float(weight[(first > 0) != (second > 0)].sum() / max(float(weight.sum()), 1e-9))
         return share if np.count_nonzero(inside) >= FEWEST_PIXELS else np.nan
 
-    def _read_bit(self, image: int | None, inverse: int | None) -> tuple[np.ndarray, np.ndarray, float, float]:
-        """Return value and decided mask of a bit, (p,) bool each, its share of decided pixels, and its stripe width.
+    def _read_bit(self, image: int | None, inverse: int | None) -> BitReading:
+        """Read a bit from its image and its inverse.
 
-        ``image`` and ``inverse``: None where missing; the middle of each pixel's darkest and brightest level stands in
-        for it. The stripe width is the mean in px.
+        None where one is missing; the middle of each pixel's darkest and brightest level stands in for it.
         """
         high = self.middle if image is None else self.frames[image]
         low = self.middle if inverse is None else self.frames[inverse]
@@ -191,7 +195,8 @@ class AxisReader:
         noise = self._sample.noise * (0.71 if both else 1.0)
         decided = np.abs(height) > np.maximum(DECIDED * self.swing, DECIDED_SIGMAS * noise)
         value = height > 0
-        return value, decided, float(decided.mean()) if decided.size else 0.0, self._measure_stripe_width(value)
+        share = float(decided.mean()) if decided.size else 0.0
+        return BitReading(value, decided, share, self._measure_stripe_width(value))
 
     def _measure_stripe_width(self, value: np.ndarray) -> float:
         """Return the mean stripe width in px along the rows or along the columns, whichever is smaller."""

@@ -17,9 +17,13 @@ __all__ = ["decode", "decode_reference", "texture"]
 
 
 def decode(
-    sequence: PatternSequence, stack: np.ndarray, axis: Axis, light: FrameLight | None = None, *,
+    sequence: PatternSequence,
+    stack: np.ndarray,
+    axis: Axis,
+    light: FrameLight | None = None,
+    *,
     mask_indirect: bool = True,
-) -> PhaseMap:  # fmt: skip
+) -> PhaseMap:
     """Decode the phase map of one axis from the (n, h, w) uint8 or uint16 frames of a sequence.
 
     A pixel is masked, with a reason, rather than given a doubtful phase. Where the light differed between the

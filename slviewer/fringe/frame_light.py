@@ -300,7 +300,7 @@ def _list_candidate_models(sample: LightSample, gains: Fit) -> Iterator[tuple[tu
 
 def _locate_room_changes(
     sample: LightSample, light: Light, weight: np.ndarray
-) -> tuple[tuple[int, ...], tuple[int, ...]]:  # fmt: skip
+) -> tuple[tuple[int, ...], tuple[int, ...]]:
     """Return the frame before which a change of the room light explains most of the residual; empty if there is none.
 
     First of a change of room light alone, then together with gains. ``weight`` (p,) of the pixels.
@@ -322,7 +322,7 @@ def _locate_room_changes(
 
 def _select_room_change(
     model: LightModel, normal: np.ndarray, moment: np.ndarray, free_columns: list[int]
-) -> tuple[int, ...]:  # fmt: skip
+) -> tuple[int, ...]:
     """Return the frame before which a change of the room light explains most of the residual; empty if there is none.
 
     ``normal`` and ``moment`` of gains, uniform light and albedo. The unknowns ``free_columns``, which every change has

@@ -92,9 +92,13 @@ def mask_indirect_light(
 
 
 def _mask_unequal_bits(
-    layout: Layout, stack: np.ndarray, phase: np.ndarray, background: np.ndarray, reason: np.ndarray,
+    layout: Layout,
+    stack: np.ndarray,
+    phase: np.ndarray,
+    background: np.ndarray,
+    reason: np.ndarray,
     noise: tuple[float, float],
-) -> None:  # fmt: skip
+) -> None:
     """Set the reason INDIRECT where bits that have no edge near a pixel differ in black or white."""
     count, cell = len(layout.gray), layout.gray_cell_px
     spans = [cell * 2.0 ** (count - bit) for bit in range(count)]
@@ -150,9 +154,15 @@ def _compare_bits(stack, first, frames, inverses, spans, limits, phase, backgrou
 
 
 def _detect_weak_fringes(
-    white_frame: np.ndarray, clipped: float, phase: np.ndarray, modulation: np.ndarray, background: np.ndarray,
-    reason: np.ndarray, noise: tuple[float, float], is_narrow: bool,
-) -> np.ndarray:  # fmt: skip
+    white_frame: np.ndarray,
+    clipped: float,
+    phase: np.ndarray,
+    modulation: np.ndarray,
+    background: np.ndarray,
+    reason: np.ndarray,
+    noise: tuple[float, float],
+    is_narrow: bool,
+) -> np.ndarray:
     """Return (h, w) bool: valid pixels whose fringes are weak for their white light, compared with the image's.
 
     Of sharp fringes the amplitude is half of the white light. Blur makes them weaker: the projector's, which changes

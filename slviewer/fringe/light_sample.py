@@ -143,7 +143,7 @@ def estimate_albedo(sequence: PatternSequence, frames: np.ndarray, changes: Sequ
 
 def _compute_half_range(
     frames: np.ndarray, coded: Sequence[int], partner: Sequence[int], changes: Sequence[int]
-) -> np.ndarray:  # fmt: skip
+) -> np.ndarray:
     """Return half the difference, float32 grey levels, of bright and dark among the ``coded`` frames.
 
     This is the largest difference between a bit and its inverse, which see the same room light; without inverses, the

@@ -16,7 +16,8 @@ BESIDE = 2
 """Number of frames before and after those of a period that are compared with them."""
 HIGHEST = 6
 """The highest harmonic of the fringe that is attributed to gamma."""
-_ONE_SIDED = 0.5
+ONE_SIDED = 0.5
+"""Length of the mean unit phasor from which pixels do not cover all phases of the fringe."""
 _OUTLIER_CLIPS = 0.5  # a frame that alone clips more of the pixels shows something else, and does not count as clipped
 
 
@@ -57,7 +58,7 @@ class Fringe:
     @property
     def turns(self) -> bool:
         """Whether the pixels cover all phases of the fringe; only then can light and phase changes be separated."""
-        return abs(complex(np.mean(self.phasor / np.maximum(np.abs(self.phasor), 1e-6)))) < _ONE_SIDED
+        return measure_concentration(self.phasor) < ONE_SIDED
 
 
 def cosine_columns(steps: np.ndarray, n: int, own: int) -> np.ndarray:
@@ -104,8 +105,7 @@ def sample_fringe(stack: np.ndarray, shift: Shift, noise: tuple[float, float], w
     if n > 3:
         frames = levels - fit_common_harmonics(levels, phasor, own)
         background, phasor = fit_cosine(frames)
-    angle = (2 * np.pi * np.arange(n) / n)[:, None]
-    fitted = background + np.real(phasor * np.exp(1j * angle).astype(np.complex64))
+    fitted = evaluate_cosine(background, phasor, n)
     neighbours = {
         i: stack[i][rows].ravel()[valid].astype(np.float32) for i in _list_adjacent_frames(shift.indices, len(stack))
     }
@@ -134,6 +134,17 @@ def fit_cosine(frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     phasor = np.empty(frames.shape[1], np.complex64)
     phasor.real, phasor.imag = np.einsum("wk,kp->wp", np.stack([wave.real, wave.imag]), frames)
     return frames.mean(axis=0), phasor
+
+
+def evaluate_cosine(background: np.ndarray, phasor: np.ndarray, n: int) -> np.ndarray:
+    """Return the n steps (n, p) float32 of the cosines that `fit_cosine` has fitted."""
+    angle = (2 * np.pi * np.arange(n) / n)[:, None]
+    return np.asarray(background + np.real(phasor * np.exp(1j * angle).astype(np.complex64)))
+
+
+def measure_concentration(phasor: np.ndarray) -> float:
+    """Return the length of the mean unit phasor (p,): 0 for evenly spread phases, 1 for a common one."""
+    return abs(complex(np.mean(phasor / np.maximum(np.abs(phasor), 1e-6))))
 
 
 def fit_common_harmonics(frames: np.ndarray, phasor: np.ndarray, own: int) -> np.ndarray:

@@ -189,19 +189,19 @@ class PatternSequence:
 
     def sign(self, axis: Axis) -> int:
         """Return ``phase_sign`` of the axis, 1 or -1."""
-        return _select_axis_value(self.phase_sign, axis)
+        return select_axis_value(self.phase_sign, axis)
 
     def offset_rad(self, axis: Axis) -> float:
         """Return ``phase_offset_rad`` of the axis."""
-        return float(_select_axis_value(self.phase_offset_rad, axis))
+        return float(select_axis_value(self.phase_offset_rad, axis))
 
     def origin_px(self, axis: Axis) -> float:
         """Return ``gray_origin_px`` of the axis."""
-        return _select_axis_value(self.gray_origin_px, axis)
+        return select_axis_value(self.gray_origin_px, axis)
 
     def gray_cell(self, axis: Axis) -> float:
         """Return the width, px, of the cells that the Gray bits of the axis number."""
-        cell = _select_axis_value(self.gray_cell_px, axis)
+        cell = select_axis_value(self.gray_cell_px, axis)
         if cell is not None:
             return float(cell)
         periods = self.periods_px(axis)
@@ -220,6 +220,10 @@ class PatternSequence:
         """Return the indices of the axis' frames of one kind, in order."""
         return [i for i in self.select(axis) if self.frames[i].kind == kind]
 
+    def bits(self, kind: Kind, axis: Axis) -> tuple[int, ...]:
+        """Return the indices of the axis' frames of one kind, the most significant bit first."""
+        return tuple(sorted(self.find(kind, axis), key=lambda i: self.frames[i].bit))
+
     def phase_shifts(self, axis: Axis) -> tuple[tuple[float, tuple[int, ...]], ...]:
         """Return (period px, frame indices by step) of each phase shift of the axis, longest period first."""
         steps = sorted(self.find("phase", axis), key=lambda i: self.frames[i].step)
@@ -236,7 +240,7 @@ class PatternSequence:
                 f"axis {axis}: phase_offset (phase_offset_rad) is {self.offset_rad(axis)} rad and gray_origin "
                 f"(gray_origin_px) {self.origin_px(axis)} px: give finite numbers"
             )
-        cell = _select_axis_value(self.gray_cell_px, axis)
+        cell = select_axis_value(self.gray_cell_px, axis)
         if cell is not None and not (isfinite(cell) and cell > 0):
             raise InputError(f"axis {axis}: a Gray cell of {cell} px does not exist: give its width in projector px")
 
@@ -338,7 +342,7 @@ def parse_size(text: Any) -> tuple[int, int]:
     return width, height
 
 
-def _select_axis_value(values: Any, axis: Axis) -> Any:
+def select_axis_value(values: Any, axis: Axis) -> Any:
     """Return the value of one axis, from a common value or a pair."""
     return getattr(values, axis) if isinstance(values, PerAxis) else values
 
