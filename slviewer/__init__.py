@@ -55,7 +55,7 @@ if TYPE_CHECKING:
     from slviewer.pipeline.reconstruct import reconstruct
     from slviewer.pipeline.verify import Verification, verify
     from slviewer.reconstruction.cloud import Cloud
-    from slviewer.reconstruction.reconstruct import reconstruct as reconstruct_cloud
+    from slviewer.reconstruction.reconstruct import reconstruct_cloud
     from slviewer.registration.multiway import register_all as align_clouds
     from slviewer.report.maps import error_maps as draw_error_maps
     from slviewer.session.measurements import Measurement
@@ -108,7 +108,7 @@ _EXPORTS = {
     "plugins": "plugins:*",
     "read_captures": "pipeline.import_captures",
     "reconstruct": "pipeline.reconstruct",
-    "reconstruct_cloud": "reconstruction.reconstruct:reconstruct",
+    "reconstruct_cloud": "reconstruction.reconstruct",
     "save_calibration": "pipeline.calibrate",
     "texture": "fringe.decode",
     "verify": "pipeline.verify",

@@ -100,7 +100,7 @@ def failed_tests(frames: AxisFrames, a: Agreement) -> set[str]:
     return failed
 
 
-def is_supported(frames: AxisFrames, a: Agreement) -> bool:
+def has_evidence(frames: AxisFrames, a: Agreement) -> bool:
     """Return whether the frames give positive evidence for a hypothesis, rather than merely no test against it.
 
     Every share that can be measured must exceed ``SURE``, and enough code edges, or several periods, must be in view.
@@ -114,7 +114,7 @@ def is_supported(frames: AxisFrames, a: Agreement) -> bool:
 
 def is_proven(frames: AxisFrames, a: Agreement) -> bool:
     """Return whether the frames fail no test, and give positive evidence as well."""
-    return not failed_tests(frames, a) and is_supported(frames, a)
+    return not failed_tests(frames, a) and has_evidence(frames, a)
 
 
 def wrap(turns: float) -> float:

@@ -13,7 +13,7 @@ from slviewer.fringe.agreement_tests import (
     Answer,
     explain,
     failed_tests,
-    is_supported,
+    has_evidence,
     wrap,
 )
 from slviewer.fringe.axis_agreement import FEWEST_EDGES, Agreement, common_phase, fit_turns, measure_agreement
@@ -192,7 +192,7 @@ def _fit_level_offset(
     """Fit the phase offset to frames of several periods without Gray bits; return the changes, None without any."""
     a = measure_agreement(reader, frames)
     failed = failed_tests(frames, a)
-    if "levels" in failed or not is_supported(frames, a):
+    if "levels" in failed or not has_evidence(frames, a):
         return None
     if not failed:
         return explain(changes, a) if changes else None

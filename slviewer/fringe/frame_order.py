@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
 
-from slviewer.fringe.agreement_tests import SURE, Answer, failed_tests, is_proven, is_supported, sum_shares
+from slviewer.fringe.agreement_tests import SURE, Answer, failed_tests, has_evidence, is_proven, sum_shares
 from slviewer.fringe.axis_agreement import measure_agreement, measure_code_agreement
 from slviewer.fringe.axis_reader import AxisFrames, AxisReader, described_frames
 from slviewer.fringe.contradiction import Contradiction
@@ -170,9 +170,9 @@ def _score_order(
     score, is_any_supported = 0.0, False
     for axis, frames in described.items():
         a = measure_agreement(readers[axis], frames)
-        supported = is_supported(frames, a)
-        if not failed_tests(frames, a) and (supported or _lacks_steps(frames)):
-            is_any_supported |= supported
+        is_supported = has_evidence(frames, a)
+        if not failed_tests(frames, a) and (is_supported or _lacks_steps(frames)):
+            is_any_supported |= is_supported
             score += sum_shares(a)
         elif readers[axis].is_in_view(frames):
             return None

@@ -66,29 +66,42 @@ def code_row(stack, frames, inverses, row, threshold, code, least, top, bottom, 
     From k - 1 to k the Gray bit changes at whose place k has its last binary 1; from k to k + 1 that of its last 0. A
     code without such a bit has no such edge: infinite.
     """
+    if len(inverses):
+        opposed_code_row(stack, frames, inverses, row, code, least, top, bottom, lower, upper)
+    else:
+        plain_code_row(stack, frames, row, threshold, code, least, top, bottom, lower, upper)
+
+
+@numba.njit(inline="always")
+def opposed_code_row(stack, frames, inverses, row, code, least, top, bottom, lower, upper):
+    """Read the binary code of one image row from bits and their inverses, see `code_row`."""
     width = stack.shape[2]
     none, nothing = np.float32(np.inf), np.float32(0)
+    digits = np.zeros(width, np.uint8)
     for x in range(width):
         code[x] = 0
-    if len(inverses):
-        digits = np.zeros(width, np.uint8)
+        top[x] = bottom[x] = nothing
+        least[x] = lower[x] = upper[x] = none
+    for b in range(len(frames)):
+        frame, inverse = stack[frames[b], row], stack[inverses[b], row]
         for x in range(width):
-            top[x] = bottom[x] = nothing
-            least[x] = lower[x] = upper[x] = none
-        for b in range(len(frames)):
-            frame, inverse = stack[frames[b], row], stack[inverses[b], row]
-            for x in range(width):
-                height = (np.float32(frame[x]) - np.float32(inverse[x])) * np.float32(0.5)
-                one = np.uint8(digits[x] ^ np.uint8(height > 0))
-                at_lower, at_upper = lower[x], upper[x]
-                digits[x] = one
-                code[x] = np.int32(np.int32(code[x] + code[x]) | np.int32(one))
-                least[x] = min(least[x], abs(height))
-                top[x] = max(top[x], height)
-                bottom[x] = min(bottom[x], height)
-                lower[x] = height if one != 0 else at_lower
-                upper[x] = at_upper if one != 0 else height
-        return
+            height = (np.float32(frame[x]) - np.float32(inverse[x])) * np.float32(0.5)
+            one = np.uint8(digits[x] ^ np.uint8(height > 0))
+            at_lower, at_upper = lower[x], upper[x]
+            digits[x] = one
+            code[x] = np.int32(np.int32(code[x] + code[x]) | np.int32(one))
+            least[x] = min(least[x], abs(height))
+            top[x] = max(top[x], height)
+            bottom[x] = min(bottom[x], height)
+            lower[x] = height if one != 0 else at_lower
+            upper[x] = at_upper if one != 0 else height
+
+
+@numba.njit(inline="always")
+def plain_code_row(stack, frames, row, threshold, code, least, top, bottom, lower, upper):
+    """Read the binary code of one image row from bits and their threshold, see `code_row`."""
+    width = stack.shape[2]
+    none, nothing = np.float32(np.inf), np.float32(0)
     # Against one threshold the frames' own numbers can be compared: four times as many fit a register.
     grey = stack.dtype.type
     full = grey(65535 if stack.itemsize == 2 else 255)
@@ -100,7 +113,7 @@ def code_row(stack, frames, inverses, row, threshold, code, least, top, bottom, 
         level[x] = grey(np.int32(threshold[x]))
         over_least[x] = fewest[x] = full
         under_most[x] = most[x] = at_one[x] = at_nought[x] = grey(0)
-        bits[x] = 0
+        bits[x] = code[x] = 0
     for start in range(0, len(frames), 8):
         last = min(start + 8, len(frames))
         if (last - start) % 2:

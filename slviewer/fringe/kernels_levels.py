@@ -47,6 +47,21 @@ class Ladder(NamedTuple):
 
 
 @numba.njit
+def read_cell_bits(stack, row, x, threshold, bits, inverses, heights):
+    """Read the Gray bits of a pixel, whose ``heights`` (b,) it fills; return their code, the highest and the lowest."""
+    code, bit, top, bottom = 0, 0, np.float32(0), np.float32(0)
+    for b in range(len(bits)):
+        value = np.float32(stack[bits[b], row, x])
+        height = value - threshold
+        if inverses[b] >= 0:
+            height = (value - np.float32(stack[inverses[b], row, x])) * np.float32(0.5)
+        bit ^= int(height > 0)
+        code = 2 * code + bit
+        heights[b], top, bottom = height, max(top, height), min(bottom, height)
+    return code, top, bottom
+
+
+@numba.njit
 def cell_row(stack, row, B, A, ladder, heights, cell, worst):
     """Compute the coordinates px of the cells of one row that the bits number, or of the border that a pixel is at.
 
@@ -57,15 +72,7 @@ def cell_row(stack, row, B, A, ladder, heights, cell, worst):
     last = len(bits) - 1
     mean, half, nothing = np.float32(ladder.mean), np.float32(0.5), np.float32(0)
     for x in range(len(cell)):
-        code, bit, top, bottom = 0, 0, nothing, nothing
-        for b in range(len(bits)):
-            value = np.float32(stack[bits[b], row, x])
-            height = value - A[x]
-            if inverses[b] >= 0:
-                height = (value - np.float32(stack[inverses[b], row, x])) * half
-            bit ^= int(height > 0)
-            code = 2 * code + bit
-            heights[b], top, bottom = height, max(top, height), min(bottom, height)
+        code, top, bottom = read_cell_bits(stack, row, x, A[x], bits, inverses, heights)
         contrast = max(top / (1 - mean), -bottom / mean)
         middle = (half - mean) * contrast
         zeros, ones = 0, 0

@@ -172,7 +172,7 @@ def check_phases(
             )
         return CaptureCheck(1.0, (*warnings, *_depth_warning(name, depths, depth_range)))
     pixels, measured, sigma = _samples(phases)
-    agreement = measure_agreement(calibration, pixels, measured, sigma)
+    agreement = measure_axis_agreement(calibration, pixels, measured, sigma)
     if agreement is None:
         return CaptureCheck()
     if agreement.is_refused:
@@ -202,8 +202,8 @@ def local_misfit(
     """Return the misfit of the axes in px of the projector for each of `TILES` of the image, beyond what is predicted
     there; 0 where noise and the calibration's residuals explain it, None where they do so everywhere.
 
-    ``pixels``, ``measured`` and ``sigma`` (n, 2) as `measure_agreement` takes them. What disturbs one axis disturbs the
-    other about as much.
+    ``pixels``, ``measured`` and ``sigma`` (n, 2) as `measure_axis_agreement` takes them. What disturbs one axis
+    disturbs the other about as much.
     """
     rig = calibration.pinholes
     distance, normal = epipolar_distance(rig, *calibration.undistort_pairs(pixels, measured))
@@ -220,7 +220,7 @@ def local_misfit(
     return excess if excess.any() else None
 
 
-def measure_agreement(
+def measure_axis_agreement(
     calibration: Calibration, pixels: np.ndarray, measured: np.ndarray, sigma: np.ndarray
 ) -> AxisAgreement | None:
     """How far camera ``pixels`` (n, 2) and the projector coordinates ``measured`` there (n, 2) px, of noise ``sigma``

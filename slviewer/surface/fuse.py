@@ -17,7 +17,7 @@ from slviewer.geometry.rigid import move_points
 from slviewer.reconstruction.cloud import Cloud, choose_pixels
 from slviewer.surface.agreement import SurfaceAgreement, colour_gains, compare_views
 from slviewer.surface.clean import viewing_cosines
-from slviewer.surface.overlap_kernels import FIELDS, add_surface, count_votes
+from slviewer.surface.overlap_kernels import FIELDS, add_surface, add_votes
 from slviewer.surface.shapes import PointSet
 from slviewer.surface.view import View, prepare_view
 
@@ -121,7 +121,7 @@ def _detect_violations(
                 T = np.linalg.inv(there.T) @ view.T
                 # along the viewing direction two surfaces may be farther apart than along their normal
                 gate = 2.0 * max(_gate_mm(pairs, name, other, view, there), view.spacing, there.spacing)
-                count_votes(
+                add_votes(
                     move_points(T, points), gate, there.points, witnesses[other], there.to_pixel, confirming,
                     contradicting,
                 )  # fmt: skip

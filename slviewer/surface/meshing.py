@@ -135,7 +135,7 @@ def build_mesh(shape: Cloud | PointSet, plan: MeshingPlan | None = None, progres
         raise InputError("Merged points have no pixels: the method grid takes a single scan; use poisson or volume.")
     say(0.0, "finding the surface")
     points = shape if isinstance(shape, PointSet) else fuse({"scan": shape}, {"scan": np.eye(4)}).surface
-    cell = spacing(points)
+    cell = measure_spacing(points)
     limit = plan.fill_holes_mm
     if limit is None:  # only poisson knows how to go on where there is nothing
         limit = np.inf if plan.watertight and method == "poisson" else SMALL_HOLE * cell
@@ -172,7 +172,7 @@ def build_mesh(shape: Cloud | PointSet, plan: MeshingPlan | None = None, progres
     return BuiltMesh(mesh, method, cell, dropped, cut, filled, smoothed, thinned, topology)
 
 
-def spacing(points: PointSet) -> float:
+def measure_spacing(points: PointSet) -> float:
     """Median distance in mm of a point to its nearest neighbour."""
     if len(points) < 2:
         raise InputError(f"{len(points)} points make no surface.")

@@ -103,7 +103,7 @@ def measure_heights(p, n, reach, gate, points, normals, noise, lasting, inner, t
 
 
 @kernel(parallel=True)
-def count_votes(p, gate, points, witnesses, to_pixel, confirming, contradicting):
+def add_votes(p, gate, points, witnesses, to_pixel, confirming, contradicting):
     """Add a scan's votes on points ``p`` (k, 3) mm in its frame; only its pixels ``witnesses`` (h, w) bool vote.
 
     Adds 1 to ``confirming`` (k,) where its surface is within ``gate`` mm in depth, or to ``contradicting`` (k,) where
