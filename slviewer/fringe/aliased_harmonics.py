@@ -15,6 +15,7 @@ import numpy as np
 
 from slviewer.fringe import limits
 from slviewer.fringe.layout import Layout
+from slviewer.fringe.phase import Noise
 from slviewer.fringe.residual_sample import fit_cosine, select_rows
 from slviewer.fringe.suspect import Suspect
 
@@ -67,9 +68,7 @@ class AliasedHarmonics:
         return _compute_correction(theta, self.steps, self.modulation, self.phase).astype(np.float32)
 
 
-def estimate_aliased_harmonics(
-    layout: Layout, stack: np.ndarray, white: float, noise: tuple[float, float]
-) -> AliasedHarmonics:
+def estimate_aliased_harmonics(layout: Layout, stack: np.ndarray, white: float, noise: Noise) -> AliasedHarmonics:
     """Estimate the ripple that harmonics cause in the finest period of an axis; none where it has five or more steps.
 
     ``stack`` (n, h, w) under equal light, which clips at ``white``; ``noise`` (a, b) of its grey levels. About 40,000
@@ -165,7 +164,7 @@ class _Amplitude:
         return abs(self.value) > max(SIGMAS * self.error, CONTROL * abs(self.control))
 
 
-def _cut_pieces(layout: Layout, stack: np.ndarray, white: float, noise: tuple[float, float]) -> _Pieces | None:
+def _cut_pieces(layout: Layout, stack: np.ndarray, white: float, noise: Noise) -> _Pieces | None:
     """Cut rows or columns, whichever cross more fringes, into pieces; None where too few fringes are in view."""
     indices = list(layout.shifts[-1].indices)
     candidates = [_sample_lines(stack, indices, white, noise)]
@@ -193,7 +192,7 @@ def _cut_pieces(layout: Layout, stack: np.ndarray, white: float, noise: tuple[fl
 
 
 def _sample_lines(
-    stack: np.ndarray, indices: list[int], white: float, noise: tuple[float, float]
+    stack: np.ndarray, indices: list[int], white: float, noise: Noise
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
     """Return phasor, background and validity (lines, pixels) of some image rows.
 

@@ -7,7 +7,7 @@ from itertools import zip_longest
 import numpy as np
 
 from slviewer.errors import InputError
-from slviewer.fringe.axis_reader import FEWEST_PIXELS, RECENT, AxisFrames, AxisReader, BitReading
+from slviewer.fringe.axis_reader import FEWEST_PIXELS, RECENT, AxisFrames, AxisReader, BitReading, Images
 from slviewer.fringe.levels import lowest_coordinate, plan_levels, unwrap_levels
 from slviewer.fringe.limits import OUTSIDE_PX
 
@@ -128,7 +128,7 @@ class _Edges:
 
 
 def _read_checked_code(
-    reader: AxisReader, bits: tuple[int | None, ...], inverse: tuple[int | None, ...], inverted: bool
+    reader: AxisReader, bits: Images, inverse: Images, inverted: bool
 ) -> tuple[_Code, _Edges, float]:
     """Return the Gray code, its edges, and the share of the edges that obey the Gray code."""
     code = _read_code(reader, bits, inverse, inverted)
@@ -136,9 +136,7 @@ def _read_checked_code(
     return code, edges, rule
 
 
-def _read_code(
-    reader: AxisReader, images: tuple[int | None, ...], inverse: tuple[int | None, ...], inverted: bool
-) -> _Code:
+def _read_code(reader: AxisReader, images: Images, inverse: Images, inverted: bool) -> _Code:
     """Read the Gray bits, from the most significant one down to the finest that is readable."""
     bits = [
         None if image is opposite is None else reader.bit(image, opposite)

@@ -12,6 +12,8 @@ from slviewer.fringe.residual_sample import cosine_columns
 from slviewer.fringe.sequence import Axis, PatternSequence
 
 Result = TypeVar("Result")
+Images = tuple[int | None, ...]
+"""Indices of the images of some frames, None where an image is missing."""
 
 DECIDED = 0.2
 """Distance from the middle, as a share of the swing, from which a bit is decided."""
@@ -41,15 +43,15 @@ class AxisFrames:
     offset_rad: float
     origin_px: float
     cell_px: float
-    shifts: tuple[tuple[float, tuple[int | None, ...]], ...]
-    bits: tuple[int | None, ...]
-    inverse: tuple[int | None, ...]
+    shifts: tuple[tuple[float, Images], ...]
+    bits: Images
+    inverse: Images
     complementary: bool
     inverted: bool = False
     gamma: float = 1.0
 
     @property
-    def fringe(self) -> tuple[float, tuple[int | None, ...]] | None:
+    def fringe(self) -> tuple[float, Images] | None:
         """Period (px) and images of the shift that is compared with the Gray code: the one most like its cells.
 
         None for Gray code alone.
@@ -67,7 +69,7 @@ def described_frames(sequence: PatternSequence, axis: Axis, images: Sequence[int
     ``images``: None where an image is missing; frame i is image i if no images are given.
     """
 
-    def list_images(frames: Iterable[int]) -> tuple[int | None, ...]:
+    def list_images(frames: Iterable[int]) -> Images:
         """Return the image of each frame; None for a missing one."""
         return tuple(i if images is None else images[i] for i in frames)
 
@@ -207,7 +209,7 @@ class AxisReader:
         parts = ((across, edges_across), (len(self._across) - across, edges_along))
         return min((pixels / (1 + crossed) for pixels, crossed in parts if pixels), default=0.0)
 
-    def phasor(self, images: tuple[int | None, ...], frames: AxisFrames) -> np.ndarray | None:
+    def phasor(self, images: Images, frames: AxisFrames) -> np.ndarray | None:
         """Return modulation * e^(i phase), (p,) complex64; None with fewer than three of the steps."""
         wave = self._wave(images, frames.gamma)
         if wave is None:
@@ -215,14 +217,14 @@ class AxisReader:
         turned = np.exp(-1j * frames.offset_rad).astype(np.complex64)
         return (wave if frames.sign < 0 else np.conj(wave)) * turned
 
-    def unwrapped_phase(self, images: tuple[int | None, ...], frames: AxisFrames) -> np.ndarray:
+    def unwrapped_phase(self, images: Images, frames: AxisFrames) -> np.ndarray:
         """Return the phase (p,) in rad, unwrapped from pixel to pixel along each line.
 
         ``images``: steps that have a `phasor`.
         """
         return -frames.sign * self._unwrapped(images, frames.gamma)
 
-    def _fit_wave(self, images: tuple[int | None, ...], gamma: float) -> np.ndarray | None:
+    def _fit_wave(self, images: Images, gamma: float) -> np.ndarray | None:
         """Fit `phasor` (p,) complex64 for a negative phase sign and without offset; None for fewer than three steps."""
         steps = [k for k, image in enumerate(images) if image is not None]
         there = [image for image in images if image is not None]
@@ -240,7 +242,7 @@ class AxisReader:
         wave.real, wave.imag = cosine, sine
         return wave
 
-    def _unwrap_wave(self, images: tuple[int | None, ...], gamma: float) -> np.ndarray:
+    def _unwrap_wave(self, images: Images, gamma: float) -> np.ndarray:
         """Compute `unwrapped_phase` (p,) for a negative phase sign."""
         wave = self._wave(images, gamma)
         assert wave is not None

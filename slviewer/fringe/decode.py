@@ -8,7 +8,7 @@ from slviewer.fringe.kernels_spikes import spike_rules
 from slviewer.fringe.layout import Layout, axis_layout, check_stack, white_level
 from slviewer.fringe.levels import cell_misfit, code_cell_px, layout_levels, lowest_coordinate, unambiguous_px
 from slviewer.fringe.noise import measure_noise
-from slviewer.fringe.phase import PhaseMap
+from slviewer.fringe.phase import Noise, PhaseMap
 from slviewer.fringe.reference import code_bits, complete_map, dark_sigmas, decode_reference, phase_shift
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.fringe.threshold import MIDDLE, fringe_mean
@@ -84,7 +84,7 @@ def _repair_spikes(layout: Layout, phase: np.ndarray, reason: np.ndarray) -> Non
     kernels_spikes.mask_phases(*lists, phase, reason)
 
 
-def grey_scale(layout: Layout, noise: tuple[float, float], white: float) -> kernels.Scale:
+def grey_scale(layout: Layout, noise: Noise, white: float) -> kernels.Scale:
     """Return the grey levels that decide about a pixel, from the noise (a, b) and the clipping level ``white``."""
     return kernels.Scale(*noise, limits.DARK_LEVELS * white / 255, dark_sigmas(layout), white)
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from slviewer.fringe.line_sample import LineSample
 from slviewer.fringe.residual_sample import evaluate_cosine, fit_cosine, measure_concentration
+from slviewer.fringe.sequence import Indices
 
 MOST_STEPS = 36
 MOST_BITS = 16
@@ -47,7 +48,7 @@ DIM = 0.25
 """Share of the brightest pixels' swing below which a pixel may show reflections of other stripes."""
 
 Even = Literal["white", "black"]
-Doubt = tuple[tuple[int, ...], str]
+Doubt = tuple[Indices, str]
 """Images, and why it is doubtful what they show."""
 
 
@@ -59,7 +60,7 @@ class PhaseRun:
     ``misfit``: rms residual of the cosine, as a share of the amplitude.
     """
 
-    images: tuple[int, ...]
+    images: Indices
     gradient: tuple[float, float]
     misfit: float
 
@@ -80,7 +81,7 @@ class Bit:
     even: Even | None
 
     @property
-    def images(self) -> tuple[int, ...]:
+    def images(self) -> Indices:
         """Image of the bit, then that of its inverse."""
         return (self.image,) if self.inverse is None else (self.image, self.inverse)
 
@@ -92,7 +93,7 @@ class GrayBlock:
     bits: tuple[Bit, ...]
 
     @property
-    def images(self) -> tuple[int, ...]:
+    def images(self) -> Indices:
         """Images of all bits and inverses, in order of capture."""
         return tuple(sorted(image for bit in self.bits for image in bit.images))
 
@@ -142,14 +143,14 @@ class BlockReader:
         """Number of sampled pixels that vary."""
         return self.levels.shape[1]
 
-    def phasor(self, images: tuple[int, ...]) -> np.ndarray:
+    def phasor(self, images: Indices) -> np.ndarray:
         """Fit modulation * e^(i phase), (p,) complex64, to images that are equidistant steps.
 
         The phase rises with the step.
         """
         return fit_cosine(self.levels[list(images)])[1]
 
-    def run(self, images: tuple[int, ...]) -> PhaseRun | None:
+    def run(self, images: Indices) -> PhaseRun | None:
         """Return the images as a run of all steps of one period; None if they are not."""
         rows = list(images)
         if float(self._in_middle[rows].mean()) < MIN_MIDDLE or not _is_cosine(self._coarse[rows], COARSE):

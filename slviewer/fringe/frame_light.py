@@ -25,7 +25,7 @@ from slviewer.fringe.light_fit import (
     light_model,
 )
 from slviewer.fringe.light_sample import MIN_PIXELS, LightSample, estimate_albedo, sample_light
-from slviewer.fringe.sequence import Axis, PatternSequence
+from slviewer.fringe.sequence import Axis, Indices, PatternSequence
 from slviewer.fringe.suspect import Fault, Suspect
 
 LEAST_GAIN = 0.005
@@ -298,9 +298,7 @@ def _list_candidate_models(sample: LightSample, gains: Fit) -> Iterator[tuple[tu
             yield terms, replace(start, gain=constant.gain, changes=changes)
 
 
-def _locate_room_changes(
-    sample: LightSample, light: Light, weight: np.ndarray
-) -> tuple[tuple[int, ...], tuple[int, ...]]:
+def _locate_room_changes(sample: LightSample, light: Light, weight: np.ndarray) -> tuple[Indices, Indices]:
     """Return the frame before which a change of the room light explains most of the residual; empty if there is none.
 
     First of a change of room light alone, then together with gains. ``weight`` (p,) of the pixels.
@@ -320,9 +318,7 @@ def _locate_room_changes(
     )
 
 
-def _select_room_change(
-    model: LightModel, normal: np.ndarray, moment: np.ndarray, free_columns: list[int]
-) -> tuple[int, ...]:
+def _select_room_change(model: LightModel, normal: np.ndarray, moment: np.ndarray, free_columns: list[int]) -> Indices:
     """Return the frame before which a change of the room light explains most of the residual; empty if there is none.
 
     ``normal`` and ``moment`` of gains, uniform light and albedo. The unknowns ``free_columns``, which every change has

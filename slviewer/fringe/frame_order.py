@@ -9,7 +9,7 @@ from functools import cache
 
 from slviewer.fringe.agreement_tests import SURE, Answer, failed_tests, has_evidence, is_proven, sum_shares
 from slviewer.fringe.axis_agreement import measure_agreement, measure_code_agreement
-from slviewer.fringe.axis_reader import AxisFrames, AxisReader, described_frames
+from slviewer.fringe.axis_reader import AxisFrames, AxisReader, Images, described_frames
 from slviewer.fringe.contradiction import Contradiction
 from slviewer.fringe.frame_likeness import FrameLikeness
 from slviewer.fringe.ghost import detect_ghosting
@@ -17,7 +17,7 @@ from slviewer.fringe.layout import Shift
 from slviewer.fringe.line_sample import LineSample
 from slviewer.fringe.residual_order import detect_misordered_steps, detect_strange_frames, recover_step_order
 from slviewer.fringe.residual_sample import BESIDE, sample_fringe
-from slviewer.fringe.sequence import Axis, PatternSequence
+from slviewer.fringe.sequence import Axis, Indices, PatternSequence
 from slviewer.fringe.suspect import Suspect
 
 NAMED_BY_STEPS = 0.5
@@ -25,8 +25,6 @@ NAMED_BY_STEPS = 0.5
 
 COARSE_MARGIN = 0.15
 """Tolerance of the length of a mean unit vector between a sample and a small part of it."""
-
-Images = tuple[int | None, ...]
 
 
 @dataclass(frozen=True)
@@ -89,7 +87,7 @@ class StepReader:
             if findings is not None:
                 yield findings
 
-    def _judge_period(self, shift: Shift, first: int, seen: tuple[int, ...]) -> _StepFindings | None:
+    def _judge_period(self, shift: Shift, first: int, seen: Indices) -> _StepFindings | None:
         """Return the findings of one period, image ``seen[i]`` shown as frame ``first + i``; None without fringes."""
         lines, white = self._sample.lines, self._sample.white
         images = [*range(first), *seen, *range(first + len(seen), len(lines))]

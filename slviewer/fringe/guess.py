@@ -14,7 +14,7 @@ from slviewer.fringe.description_change import LINES, step_turns
 from slviewer.fringe.description_check import LEAST_ILLUMINATED, check_description
 from slviewer.fringe.frame_blocks import Bit, BlockReader, Doubt, FrameBlocks, GrayBlock, PhaseRun, group_frames
 from slviewer.fringe.line_sample import LineSample, coded_frames, sample_frames
-from slviewer.fringe.sequence import Axis, Frame, PatternSequence, PerAxis, select_axis_value
+from slviewer.fringe.sequence import Axis, Frame, Indices, PatternSequence, PerAxis, Size, select_axis_value
 
 ASSUMED_PX = 16.0
 """px of the finest period where nothing states it: a scale, and no measurement."""
@@ -66,7 +66,7 @@ class _AxisBlocks:
     code: GrayBlock | None
 
 
-def guess_sequence(stack: np.ndarray, projector: tuple[int, int] | None = None) -> Guess:
+def guess_sequence(stack: np.ndarray, projector: Size | None = None) -> Guess:
     """Guess the frames that the images of an (n, h, w) uint8 or uint16 stack show, in the order of the capture.
 
     ``projector``: (width, height) px where it is known. Periods in projector px follow from the images only where Gray
@@ -338,7 +338,7 @@ def _scale_to_projector(
     sequence: PatternSequence,
     axis: Axis,
     sample: LineSample,
-    projector: tuple[int, int] | None,
+    projector: Size | None,
     findings: _Findings,
 ) -> PatternSequence:
     """Return the sequence with the periods of one axis scaled to projector px.
@@ -379,7 +379,7 @@ def _scale_to_projector(
     return replace(sequence, frames=scaled, gray_cell_px=cells)
 
 
-def _check_code(images: tuple[int, ...], axis: Axis, frames: AxisFrames, a: Agreement, findings: _Findings) -> None:
+def _check_code(images: Indices, axis: Axis, frames: AxisFrames, a: Agreement, findings: _Findings) -> None:
     """Add a doubt where the Gray code and the fringes of an axis do not agree."""
     if not is_proven(frames, a):
         shares = f"{100 * a.rule:.0f} % of the edges obey the Gray code" if np.isfinite(a.rule) else "no edges are read"

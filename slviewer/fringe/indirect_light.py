@@ -15,7 +15,7 @@ import numpy as np
 from scipy.ndimage import uniform_filter
 
 from slviewer.fringe.layout import Layout
-from slviewer.fringe.phase import Reason
+from slviewer.fringe.phase import Noise, Reason
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.geometry.jit import kernel, read_only, run_rows
 
@@ -73,7 +73,7 @@ def mask_indirect_light(
     stack: np.ndarray,
     white: float,
     maps: tuple[np.ndarray, ...],
-    noise: tuple[float, float],
+    noise: Noise,
 ) -> None:
     """Mask, in place, the pixels of decoded ``maps`` whose frames contradict a single reflection; reason INDIRECT.
 
@@ -97,7 +97,7 @@ def _mask_unequal_bits(
     phase: np.ndarray,
     background: np.ndarray,
     reason: np.ndarray,
-    noise: tuple[float, float],
+    noise: Noise,
 ) -> None:
     """Set the reason INDIRECT where bits that have no edge near a pixel differ in black or white."""
     count, cell = len(layout.gray), layout.gray_cell_px
@@ -160,7 +160,7 @@ def _detect_weak_fringes(
     modulation: np.ndarray,
     background: np.ndarray,
     reason: np.ndarray,
-    noise: tuple[float, float],
+    noise: Noise,
     is_narrow: bool,
 ) -> np.ndarray:
     """Return (h, w) bool: valid pixels whose fringes are weak for their white light, compared with the image's.

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slviewer.errors import InputError
-from slviewer.fringe.sequence import Axis, PatternSequence
+from slviewer.fringe.sequence import Axis, Indices, PatternSequence
 
 WHITE_LEVELS = (255, 1023, 4095, 16383, 65535)
 """Full scale of the cameras whose grey levels arrive as uint16."""
@@ -23,7 +23,7 @@ class Shift:
     """Period (px) of a phase shift, and the indices of its frames by step."""
 
     period_px: float
-    indices: tuple[int, ...]
+    indices: Indices
 
 
 @dataclass(frozen=True)
@@ -40,8 +40,8 @@ class Layout:
     sign: int
     gray_origin_px: float
     shifts: tuple[Shift, ...]
-    gray: tuple[int, ...]
-    inverse: tuple[int, ...]
+    gray: Indices
+    inverse: Indices
     complementary: int | None
     white: int | None
     black: int | None

@@ -23,6 +23,7 @@ from slviewer.fringe.residual_sample import (
     fit_cosine,
     measure_concentration,
 )
+from slviewer.fringe.sequence import Indices
 
 Term = Literal["gain", "wave", "uniform", "albedo"]
 
@@ -71,7 +72,7 @@ class Light:
     cycles: float
     uniform: np.ndarray
     albedo: np.ndarray
-    changes: tuple[int, ...] = ()
+    changes: Indices = ()
 
     @classmethod
     def constant(cls, count: int) -> "Light":
@@ -79,7 +80,7 @@ class Light:
         return cls(np.ones(count), np.zeros((count, 2)), 0.0, np.zeros(count), np.zeros((count, 3)))
 
     @property
-    def key(self) -> tuple[bytes | float | tuple[int, ...], ...]:
+    def key(self) -> tuple[bytes | float | Indices, ...]:
         """Key of the values that equalized frames depend on, the same for equal lights."""
         return (
             *(part.tobytes() for part in (self.gain, self.wave, self.uniform, self.albedo)),
@@ -106,7 +107,7 @@ class Fit:
     variance: float
     share: float
     weight: np.ndarray
-    informed: tuple[int, ...]
+    informed: Indices
 
 
 def fit_light(
@@ -420,7 +421,7 @@ class Remainder:
         self._add_priors(normal, moment, light, terms, share, total)
         return normal, moment
 
-    def _build_change_matrix(self, terms: Sequence[Term], changes: tuple[int, ...], total: int) -> np.ndarray:
+    def _build_change_matrix(self, terms: Sequence[Term], changes: Indices, total: int) -> np.ndarray:
         """Return the matrix (total, unknowns) that expands the steps of the room light to the values of each frame.
 
         Gains and waves have one unknown per frame.

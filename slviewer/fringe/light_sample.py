@@ -11,7 +11,7 @@ import numpy as np
 from slviewer.fringe import limits
 from slviewer.fringe.layout import white_level
 from slviewer.fringe.residual_sample import estimate_roughness, fit_cosine
-from slviewer.fringe.sequence import Kind, PatternSequence
+from slviewer.fringe.sequence import Indices, Kind, PatternSequence
 
 ROWS, COLUMNS = 48, 88
 """Sampled rows and columns: rows enough for eight cycles of flicker, pixels enough to know a gain to 0.1 %."""
@@ -45,9 +45,9 @@ class LightSample:
     frames: np.ndarray
     row: np.ndarray
     column: np.ndarray
-    shifts: tuple[tuple[int, ...], ...]
-    coded: tuple[int, ...]
-    partner: tuple[int, ...]
+    shifts: tuple[Indices, ...]
+    coded: Indices
+    partner: Indices
     interior: np.ndarray
     bright: np.ndarray
     amplitudes: np.ndarray
@@ -163,12 +163,12 @@ def steady_shift(shifts: Sequence[Sequence[int]], changes: Sequence[int]) -> int
     )
 
 
-def _list_shifts(sequence: PatternSequence) -> tuple[tuple[int, ...], ...]:
+def _list_shifts(sequence: PatternSequence) -> tuple[Indices, ...]:
     """Return the frames of every phase-shifted period, of all axes."""
     return tuple(steps for axis in sequence.axes for _, steps in sequence.phase_shifts(axis))
 
 
-def _match_partner_frames(sequence: PatternSequence, coded: tuple[int, ...]) -> tuple[int, ...]:
+def _match_partner_frames(sequence: PatternSequence, coded: Indices) -> Indices:
     """Return for each coded frame the index in ``coded`` of its inverse, or of the bit that it inverts.
 
     -1 without one.
@@ -188,8 +188,8 @@ class _CodedPixels:
 
     sequence: PatternSequence
     stack: np.ndarray
-    coded: tuple[int, ...]
-    partner: tuple[int, ...]
+    coded: Indices
+    partner: Indices
     row: np.ndarray
     column: np.ndarray
     gain: np.ndarray
@@ -243,7 +243,7 @@ def _estimate_thresholds(
     coded = pixels.coded
     ends = [i for k, i in enumerate(coded) if pixels.is_even(k)]
     reference = phased or (ends if len(ends) > 1 else coded)
-    threshold = np.mean([frames[i] / np.float32(pixels.gain[i]) for i in reference], axis=0)
+    threshold: np.ndarray = np.mean([frames[i] / np.float32(pixels.gain[i]) for i in reference], axis=0)
     alone = [k for k, other in enumerate(pixels.partner) if other < 0 and not pixels.is_even(k)]
     if not phased:
         return dict.fromkeys(alone, threshold)

@@ -17,10 +17,10 @@ from slviewer.fringe.levels import (
     unwrap_levels,
 )
 from slviewer.fringe.noise import measure_noise
-from slviewer.fringe.phase import PhaseMap, Reason
+from slviewer.fringe.phase import Noise, PhaseMap, Reason
 from slviewer.fringe.reference_spikes import repair_spikes
 from slviewer.fringe.scatter import with_scatter
-from slviewer.fringe.sequence import Axis, PatternSequence
+from slviewer.fringe.sequence import Axis, Indices, PatternSequence
 from slviewer.fringe.threshold import fringe_mean
 
 TWO_PI = 2 * np.pi
@@ -67,7 +67,7 @@ def complete_map(
     stack: np.ndarray,
     white: float,
     maps: tuple[np.ndarray, ...],
-    noise: tuple[float, float],
+    noise: Noise,
     factor: float,
     mask_indirect: bool = True,
 ) -> PhaseMap:
@@ -102,7 +102,7 @@ def complete_map(
 
 
 def phase_shift(
-    stack: np.ndarray, indices: tuple[int, ...], sign: int, offset_rad: float = 0.0
+    stack: np.ndarray, indices: Indices, sign: int, offset_rad: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return wrapped phase (rad), modulation, background and largest sample of one period, float32 (h, w) each.
 
@@ -135,7 +135,7 @@ def dark_sigmas(layout: Layout) -> float:
     return max(limits.DARK_SIGMAS, required_modulation(layout_levels(layout), steps))
 
 
-def dark_limit(background: np.ndarray, noise: tuple[float, float], white: float, sigmas: float) -> np.ndarray:
+def dark_limit(background: np.ndarray, noise: Noise, white: float, sigmas: float) -> np.ndarray:
     """Return the modulation (h, w) float32, grey levels, below which a pixel is DARK."""
     sigma = np.sqrt(np.float32(noise[0]) + np.float32(noise[1]) * background)
     return np.maximum(np.float32(limits.DARK_LEVELS * white / 255), np.float32(sigmas) * sigma)
@@ -179,7 +179,7 @@ def _decode_period_order(
 
 
 def _read_code(
-    layout: Layout, stack: np.ndarray, bits: tuple[int, ...], background: np.ndarray
+    layout: Layout, stack: np.ndarray, bits: Indices, background: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the binary number (h, w) int32 that Gray bits encode, its last digit, and the bits' heights (b, h, w)."""
     heights = np.stack([bit_heights(layout, stack, i, background) for i in bits])
@@ -228,7 +228,7 @@ def _decode_cell(
     return layout.gray_origin_px + code_cell_px(layout) * (code + part), undecided
 
 
-def code_bits(layout: Layout) -> tuple[int, ...]:
+def code_bits(layout: Layout) -> Indices:
     """Return the frames of all Gray bits, the most significant first and the complementary one last."""
     return (*layout.gray, *(() if layout.complementary is None else (layout.complementary,)))
 
@@ -251,7 +251,7 @@ def _unwrap_by_levels(
 
 
 def _decode_gray_alone(
-    layout: Layout, stack: np.ndarray, noise: tuple[float, float]
+    layout: Layout, stack: np.ndarray, noise: Noise
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return phase, modulation, background, inconsistent and dark, (h, w) each, from Gray bits alone.
 

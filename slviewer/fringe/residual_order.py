@@ -13,6 +13,7 @@ import numpy as np
 
 from slviewer.fringe.ghost import detect_ghosting
 from slviewer.fringe.residual_sample import Fringe, cosine_columns
+from slviewer.fringe.sequence import Indices
 from slviewer.fringe.suspect import Fault, Suspect
 
 _AS_EXPECTED = 0.7
@@ -193,7 +194,7 @@ class _Products:
 
 
 @lru_cache(4096)
-def _compute_residual_projector(steps: tuple[int, ...], n: int, own: int) -> tuple[np.ndarray, int]:
+def _compute_residual_projector(steps: Indices, n: int, own: int) -> tuple[np.ndarray, int]:
     """Return the (k, k) matrix that projects frames of these k steps onto their residual, and its degrees of freedom.
 
     ``n``: steps of the period; ``own``: number of harmonics fitted per pixel.
@@ -289,13 +290,13 @@ def _list_shifted_frames(places: list[int], n: int) -> Iterator[_Hypothesis]:
         yield _Hypothesis("dropped", {j: j + 1 for j in range(-1, n - 1)}, 0)
 
 
-def _report_fault(hypotheses: list[_Hypothesis], indices: tuple[int, ...]) -> Suspect:
+def _report_fault(hypotheses: list[_Hypothesis], indices: Indices) -> Suspect:
     """Return the suspect for hypotheses that explain the frames equally well."""
     texts = list(dict.fromkeys(_describe_hypothesis(hypothesis, indices) for hypothesis in hypotheses))
     return Suspect(indices[hypotheses[0].place], hypotheses[0].fault, ", or ".join(texts))
 
 
-def _describe_hypothesis(hypothesis: _Hypothesis, indices: tuple[int, ...]) -> str:
+def _describe_hypothesis(hypothesis: _Hypothesis, indices: Indices) -> str:
     """Return the sentence that reports a hypothesis to the operator; frames are counted from 1."""
     frame = indices[hypothesis.place] + 1
     other = indices[hypothesis.other] + 1 if hypothesis.other < len(indices) else frame

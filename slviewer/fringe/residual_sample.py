@@ -7,6 +7,7 @@ import numpy as np
 
 from slviewer.fringe import limits
 from slviewer.fringe.layout import Shift
+from slviewer.fringe.phase import Noise
 
 PIXELS = 60_000
 """Number of sampled pixels: their statistics are accurate to half a percent."""
@@ -38,7 +39,7 @@ class Fringe:
     beside: dict[int, np.ndarray]
     phasor: np.ndarray
     own: int
-    noise: tuple[float, float]
+    noise: Noise
     roughness: float
 
     @property
@@ -77,7 +78,7 @@ def select_rows(height: int, width: int, pixels: int = PIXELS) -> np.ndarray:
     return np.unique(np.linspace(0, height - 1, count).round().astype(int))
 
 
-def sample_fringe(stack: np.ndarray, shift: Shift, noise: tuple[float, float], white: float) -> Fringe | None:
+def sample_fringe(stack: np.ndarray, shift: Shift, noise: Noise, white: float) -> Fringe | None:
     """Return the sampled fringes of one period of a stack (n, h, w); None where too few pixels are modulated.
 
     ``noise``: (a, b) of the grey levels; ``white``: level at which the camera clips.

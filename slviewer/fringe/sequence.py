@@ -11,6 +11,10 @@ from msgspec import ValidationError, convert
 from slviewer.errors import InputError
 
 Axis = Literal["x", "y"]
+Indices = tuple[int, ...]
+"""Indices of frames in their sequence, or of images in their stack."""
+Size = tuple[int, int]
+"""Width and height, px."""
 T = TypeVar("T")
 Kind = Literal["phase", "gray", "inverse", "complementary", "white", "black", "texture"]
 
@@ -129,7 +133,7 @@ class PatternSequence:
     Raises InputError when steps or bits are missing, repeated, or contradict each other, or a value is out of range.
     """
 
-    projector_size: tuple[int, int] | None
+    projector_size: Size | None
     frames: tuple[Frame, ...]
     phase_sign: int | PerAxis[int] = 1
     gray_origin_px: float | PerAxis[float] = -0.5
@@ -159,7 +163,7 @@ class PatternSequence:
             self._check_bits(axis)
 
     @property
-    def projector(self) -> tuple[int, int]:
+    def projector(self) -> Size:
         """Projector size (width, height) in px. Raises InputError where it is not known."""
         if self.projector_size is None:
             raise InputError(
@@ -220,11 +224,11 @@ class PatternSequence:
         """Return the indices of the axis' frames of one kind, in order."""
         return [i for i in self.select(axis) if self.frames[i].kind == kind]
 
-    def bits(self, kind: Kind, axis: Axis) -> tuple[int, ...]:
+    def bits(self, kind: Kind, axis: Axis) -> Indices:
         """Return the indices of the axis' frames of one kind, the most significant bit first."""
         return tuple(sorted(self.find(kind, axis), key=lambda i: self.frames[i].bit))
 
-    def phase_shifts(self, axis: Axis) -> tuple[tuple[float, tuple[int, ...]], ...]:
+    def phase_shifts(self, axis: Axis) -> tuple[tuple[float, Indices], ...]:
         """Return (period px, frame indices by step) of each phase shift of the axis, longest period first."""
         steps = sorted(self.find("phase", axis), key=lambda i: self.frames[i].step)
         return tuple(
@@ -330,11 +334,11 @@ class PatternSequence:
         )
 
 
-def parse_size(text: Any) -> tuple[int, int]:
+def parse_size(text: Any) -> Size:
     """Parse (width, height) from "912x1140" or [912, 1140]. Raises InputError."""
     parts = text.lower().split("x") if isinstance(text, str) else text
     try:
-        width, height = convert(parts, tuple[int, int], strict=False)
+        width, height = convert(parts, Size, strict=False)
     except ValidationError as error:
         raise InputError(f"'{text}' is no size: write width and height in px like 912x1140") from error
     if not (1 <= width <= MAX_EXTENT and 1 <= height <= MAX_EXTENT):
