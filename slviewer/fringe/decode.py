@@ -3,11 +3,11 @@
 import numpy as np
 
 from slviewer.fringe import kernels, kernels_coded, kernels_gray, kernels_levels, kernels_spikes, limits
-from slviewer.fringe.frame_light import CLIPPED, FrameLight, equalize_axis
+from slviewer.fringe.decoding_task import prepare_decoding
+from slviewer.fringe.frame_light import FrameLight
 from slviewer.fringe.kernels_spikes import spike_rules
-from slviewer.fringe.layout import Layout, axis_layout, check_stack, white_level
+from slviewer.fringe.layout import Layout, axis_layout, check_stack
 from slviewer.fringe.levels import cell_misfit, code_cell_px, layout_levels, lowest_coordinate, unambiguous_px
-from slviewer.fringe.noise import measure_noise
 from slviewer.fringe.phase import Noise, PhaseMap
 from slviewer.fringe.reference import code_bits, complete_map, dark_sigmas, decode_reference, phase_shift
 from slviewer.fringe.sequence import Axis, PatternSequence
@@ -32,16 +32,9 @@ def decode(
     estimated if None. ``mask_indirect``: mask pixels of much indirect light, see `indirect_light`. Raises
     InputError when the frames are not those of the sequence, or cannot give an absolute phase.
     """
-    check_stack(sequence, stack)
-    layout = axis_layout(sequence, axis)
-    stack = np.ascontiguousarray(stack)
-    white = white_level(sequence, stack, sequence.select(axis))
-    sequence, stack, factor = equalize_axis(sequence, stack, axis, light)
-    if factor != 1:
-        layout = axis_layout(sequence, axis)
-    clipped = white if factor == 1 else CLIPPED
-    noise = measure_noise(layout, stack, clipped)
-    scale = grey_scale(layout, noise, white * factor)._replace(white=clipped)
+    task = prepare_decoding(sequence, stack, axis, light)
+    layout, stack = task.layout, task.stack
+    scale = grey_scale(layout, task.noise, task.full_scale)._replace(white=task.white)
     maps = tuple(np.empty(stack.shape[1:], dtype) for dtype in (*[np.float32] * 4, np.uint8))
     if not layout.shifts:
         kernels_gray.decode_gray(stack, scale, _pack_gray_rules(layout), maps)
@@ -52,7 +45,7 @@ def decode(
         ladder = pack_levels(layout, fringe_mean(layout, stack) if layout.gray else MIDDLE)
         kernels_levels.decode_levels(stack, pack_shifts(layout), ladder, scale, maps)
     _repair_spikes(layout, maps[0], maps[-1])
-    return complete_map(sequence, layout, stack, clipped, maps, noise, factor, mask_indirect)
+    return complete_map(task, maps, mask_indirect)
 
 
 def texture(sequence: PatternSequence, stack: np.ndarray) -> np.ndarray:

@@ -25,7 +25,7 @@ from slviewer.fringe.light_fit import (
     light_model,
 )
 from slviewer.fringe.light_sample import MIN_PIXELS, LightSample, estimate_albedo, sample_light
-from slviewer.fringe.sequence import Axis, Indices, PatternSequence
+from slviewer.fringe.sequence import Indices, PatternSequence
 from slviewer.fringe.suspect import Fault, Suspect
 
 LEAST_GAIN = 0.005
@@ -175,28 +175,6 @@ def equalize_frames(
                 out[k][clipped] = CLIPPED
     full_scale = None if sequence.full_scale is None else int(CLIPPED)
     return replace(sequence, frames=tuple(sequence.frames[i] for i in chosen), full_scale=full_scale), out, scale
-
-
-def equalize_axis(
-    sequence: PatternSequence, stack: np.ndarray, axis: Axis, light: FrameLight | None = None
-) -> tuple[PatternSequence, np.ndarray, float]:
-    """Return the sequence and the frames of one axis under equal light, and the factor of their grey levels.
-
-    Sequence and stack are returned unchanged, with the factor 1, where the light needs no correction. ``light``:
-    estimated if None.
-    """
-    light = light or estimate_frame_light(sequence, stack)
-    if not light.is_significant:
-        return sequence, stack, 1.0
-    return equalize_frames(sequence, stack, light, sequence.select(axis))
-
-
-def restore_levels(
-    modulation: np.ndarray, background: np.ndarray, noise: tuple[float, float], factor: float
-) -> tuple[np.ndarray, np.ndarray, tuple[float, float]]:
-    """Convert modulation, background and noise (a, b) of equalized frames to the grey levels of the capture."""
-    per_level = np.float32(1 / factor)
-    return modulation * per_level, background * per_level, (noise[0] / factor**2, noise[1] / factor)
 
 
 def describe_disturbance(terms: Sequence[Term]) -> tuple[Fault, str]:

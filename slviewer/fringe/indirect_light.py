@@ -14,12 +14,13 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import uniform_filter
 
-from slviewer.fringe.layout import Layout
-from slviewer.fringe.phase import Noise, Reason
-from slviewer.fringe.sequence import PatternSequence
+from slviewer.fringe.decoding_task import DecodingTask
+from slviewer.fringe.phase import Reason
 from slviewer.geometry.jit import kernel, read_only, run_rows
 
 INDIRECT = np.uint8(Reason.INDIRECT)
+Maps = tuple[np.ndarray, ...]
+"""Phase, wrapped phase, modulation, background and reason, (h, w) each."""
 BIT_SHARE = 0.65
 """Difference between the contrasts of a pixel's bits, as a share of the largest, up to which no bit is misread: that
 takes as much indirect light as direct. Adhesive tape on a board differs by up to a half, and is measured well."""
@@ -67,39 +68,20 @@ class _Sampled:
     terms: np.ndarray
 
 
-def mask_indirect_light(
-    sequence: PatternSequence,
-    layout: Layout,
-    stack: np.ndarray,
-    white: float,
-    maps: tuple[np.ndarray, ...],
-    noise: Noise,
-) -> None:
-    """Mask, in place, the pixels of decoded ``maps`` whose frames contradict a single reflection; reason INDIRECT.
-
-    ``maps``: phase, wrapped phase, modulation, background, reason, (h, w) each, of the ``stack`` (n, h, w) that the
-    ``sequence`` and its ``layout`` describe. ``white``: level at which the stack is clipped; ``noise`` (a, b).
-    """
-    phase, _, modulation, background, reason = maps
-    whites = [i for kind in ("texture", "white") for i, frame in enumerate(sequence.frames) if frame.kind == kind]
-    is_narrow = not layout.gray and len(layout.shifts) > 1 and layout.shifts[0].period_px < NARROW * layout.period_px
+def mask_indirect_light(task: DecodingTask, maps: Maps) -> None:
+    """Mask, in place, the pixels of decoded ``maps`` whose frames contradict a single reflection; reason INDIRECT."""
+    layout, phase, reason = task.layout, maps[0], maps[-1]
+    whites = [i for kind in ("texture", "white") for i, frame in enumerate(task.sequence.frames) if frame.kind == kind]
     if layout.steps >= FEWEST_STEPS and whites:
-        weak = _detect_weak_fringes(stack[whites[0]], white, phase, modulation, background, reason, noise, is_narrow)
-        reason[weak] = Reason.INDIRECT
+        reason[_detect_weak_fringes(task, task.stack[whites[0]], maps)] = Reason.INDIRECT
     if layout.gray:
-        _mask_unequal_bits(layout, stack, phase, background, reason, noise)
+        _mask_unequal_bits(task, maps)
     phase[reason == Reason.INDIRECT] = np.nan
 
 
-def _mask_unequal_bits(
-    layout: Layout,
-    stack: np.ndarray,
-    phase: np.ndarray,
-    background: np.ndarray,
-    reason: np.ndarray,
-    noise: Noise,
-) -> None:
+def _mask_unequal_bits(task: DecodingTask, maps: Maps) -> None:
     """Set the reason INDIRECT where bits that have no edge near a pixel differ in black or white."""
+    layout, (phase, _, _, background, reason) = task.layout, maps
     count, cell = len(layout.gray), layout.gray_cell_px
     spans = [cell * 2.0 ** (count - bit) for bit in range(count)]
     frames, inverses = list(layout.gray), list(layout.inverse) or [-1] * count
@@ -114,8 +96,8 @@ def _mask_unequal_bits(
         np.array([inverses[k] for k in wide]),
         np.array([spans[k] for k in wide]),
     )
-    limits = np.array([layout.period_px / (2 * np.pi), layout.gray_origin_px, guard, *noise], np.float64)
-    stack = read_only(stack)
+    limits = np.array([layout.period_px / (2 * np.pi), layout.gray_origin_px, guard, *task.noise], np.float64)
+    stack = read_only(task.stack)
 
     def compare(first: int, last: int) -> None:
         """Compare the bits of a range of rows."""
@@ -153,24 +135,17 @@ def _compare_bits(stack, first, frames, inverses, spans, limits, phase, backgrou
                 reason[i, x] = INDIRECT
 
 
-def _detect_weak_fringes(
-    white_frame: np.ndarray,
-    clipped: float,
-    phase: np.ndarray,
-    modulation: np.ndarray,
-    background: np.ndarray,
-    reason: np.ndarray,
-    noise: Noise,
-    is_narrow: bool,
-) -> np.ndarray:
+def _detect_weak_fringes(task: DecodingTask, white_frame: np.ndarray, maps: Maps) -> np.ndarray:
     """Return (h, w) bool: valid pixels whose fringes are weak for their white light, compared with the image's.
 
     Of sharp fringes the amplitude is half of the white light. Blur makes them weaker: the projector's, which changes
     evenly over a depth range, and the camera's, by the square of the phase's gradient. Both are fitted.
     """
+    layout, noise, (phase, _, modulation, background, reason) = task.layout, task.noise, maps
     nothing = np.zeros(phase.shape, bool)
+    is_narrow = not layout.gray and len(layout.shifts) > 1 and layout.shifts[0].period_px < NARROW * layout.period_px
     share = WEAK_NARROW if is_narrow else WEAK
-    valid = (reason == Reason.VALID) & (white_frame < clipped) & (white_frame > background)
+    valid = (reason == Reason.VALID) & (white_frame < task.white) & (white_frame > background)
     if np.count_nonzero(valid) < FEWEST:
         return nothing
     weight = valid.astype(np.float32)

@@ -7,7 +7,8 @@ where it is curved, so that nothing is smoothed beyond one scan's resolution.
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -157,11 +158,11 @@ def _fuse_scan(
     view, order = views[name], list(views)
     mask = view.mask
     points, normals = (choose_pixels(values, mask) for values in (view.points, view.normals))
-    noise, lasting, inner = view.noise[mask], view.lasting[mask], view.inner[mask]
+    noise, systematic, inner = view.noise[mask], view.systematic[mask], view.inner[mask]
     R = view.T[:3, :3]
-    weight = inner / (noise.astype(np.float64) ** 2 + lasting.astype(np.float64) ** 2)
+    weight = inner / (noise.astype(np.float64) ** 2 + systematic.astype(np.float64) ** 2)
     sums = np.zeros((len(points), FIELDS))
-    sums[:, 0], sums[:, 2], sums[:, 3] = weight, (weight * noise) ** 2, weight * lasting
+    sums[:, 0], sums[:, 2], sums[:, 3] = weight, (weight * noise) ** 2, weight * systematic
     sums[:, 4:7] = weight[:, None] * (normals @ R.T)
     own_colours = None
     if gains is not None and view.colours is not None:
@@ -174,25 +175,17 @@ def _fuse_scan(
     for other, there in views.items():
         if (name, other) not in pairs and (other, name) not in pairs:
             continue
-        T = np.linalg.inv(there.T) @ view.T
         overlap = np.zeros((len(points), FIELDS))
         add_surface(
-            np.ascontiguousarray(move_points(T, points)),
-            np.ascontiguousarray(normals @ T[:3, :3].T),
+            *view.move_into(there, points, normals),
             view.quality[mask],
             np.ascontiguousarray(there.T[:3, :3]),
             max(view.spacing, there.spacing),
             _gate_mm(pairs, name, other, view, there),
-            there.points,
-            there.normals,
-            there.noise,
-            there.lasting,
-            there.inner,
-            there.quality,
+            there.grid,
             there.colours if own_colours is not None else np.zeros((0, 0, 3), np.uint8),
             1.0 if gains is None else gains[other],
             order.index(other) < order.index(name),
-            there.to_pixel,
             overlap,
             inferior,
         )
@@ -225,11 +218,8 @@ def _add_pose_error(points: PointSet, covariance: np.ndarray, centre: np.ndarray
 
 def _concatenate(parts: list[PointSet]) -> PointSet:
     """Concatenate point sets; attributes that one of them lacks are None."""
-
-    def join(field: str) -> np.ndarray | None:
-        """Concatenate one attribute."""
-        values = [getattr(part, field) for part in parts]
-        return None if any(value is None for value in values) else np.concatenate(values)
-
-    points = np.concatenate([part.points for part in parts])
-    return PointSet(points, join("normals"), join("colours"), join("sigma_mm"))
+    joined: dict[str, Any] = {}
+    for field in fields(PointSet):
+        values = [getattr(part, field.name) for part in parts]
+        joined[field.name] = None if any(value is None for value in values) else np.concatenate(values)
+    return PointSet(**joined)
