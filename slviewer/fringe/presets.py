@@ -1,6 +1,7 @@
 """Ready-made pattern sequences."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from math import ceil, log2
 
 from slviewer.errors import InputError
@@ -27,9 +28,8 @@ def gray(projector: Size) -> PatternSequence:
     """Return Gray code alone, each bit followed by its inverse; x, then y, white, black (procam-calibration layout)."""
     frames: list[Frame] = []
     for axis, extent in zip(AXES, projector, strict=True):
-        bits = bits_for(extent)
-        for bit in range(bits):
-            frames += [Frame("gray", axis, bit=bit, bits=bits), Frame("inverse", axis, bit=bit, bits=bits)]
+        for bit in gray_bits(axis, bits_for(extent)):
+            frames += [bit, replace(bit, kind="inverse")]
     return PatternSequence(projector, (*frames, Frame("white"), Frame("black")))
 
 
@@ -58,7 +58,7 @@ def multifrequency(projector: Size, steps: int = 6, periods_px: Sequence[float] 
 
 
 def micro(projector: Size) -> PatternSequence:
-    """Return phase steps at four periods from 12 to at most 17 px, for surfaces that light themselves; x, y, white.
+    """Return phase steps at four periods from 12 to at most 17 px, for surfaces with interreflections; x, y, white.
 
     Micro phase shifting (Gupta and Nayar, "Micro phase shifting", CVPR 2012): light that reaches a point by way of
     other surfaces, or through the material, averages over such narrow stripes and shifts no phase. There is no long
@@ -86,11 +86,7 @@ def short(projector: Size, axis: Axis) -> PatternSequence:
     """
     finest, longest = 16.0, 1.1 * projector[AXES.index(axis)]
     between = (finest * longest) ** 0.5
-    frames = [
-        frame
-        for period, steps in ((longest, 3), (between, 3), (finest, 4))
-        for frame in phase_steps(axis, steps, period)
-    ]
+    frames = phase_steps(axis, 3, longest) + phase_steps(axis, 3, between) + phase_steps(axis, 4, finest)
     return PatternSequence(projector, (*frames, Frame("texture")))
 
 
@@ -118,12 +114,12 @@ def bits_for(cells: float) -> int:
     return max(1, ceil(log2(max(1, ceil(cells)))))
 
 
-def covering_periods(extent: int, finest: float = 16.0, ratio: float = 8.0) -> list[float]:
-    """Return periods px from the finest up to one that covers the axis.
+def covering_periods(extent: int) -> list[float]:
+    """Return periods px from 16 px up to one that covers the axis, each eight times as long as the one before.
 
-    The last is a tenth longer than the axis so that its ends cannot be confused. ``ratio``: of successive periods.
+    The last is a tenth longer than the axis so that its ends cannot be confused.
     """
-    periods = [finest]
-    while periods[-1] * ratio < extent:
-        periods.append(periods[-1] * ratio)
+    periods = [16.0]
+    while periods[-1] * 8 < extent:
+        periods.append(periods[-1] * 8)
     return [*periods, 1.1 * extent] if extent > periods[-1] else periods
