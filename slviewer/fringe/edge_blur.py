@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from slviewer.geometry.jit import kernel
 
+FloatMap = NDArray[np.float32]
 TILES = (4, 5)
 """Rows and columns of tiles in which the blur is estimated: it may vary over the image."""
 REACH = 8
@@ -59,18 +60,16 @@ class EdgeDisplacement:
     surface continues across the edge and its phase confirms the shift, which can be subtracted there.
     """
 
-    shift: NDArray[np.float32]
+    shift: FloatMap
     is_continuous: NDArray[np.bool_]
 
     @property
-    def remaining(self) -> NDArray[np.float32]:
+    def remaining(self) -> FloatMap:
         """(h, w) float32: error of a phase from which the shift was subtracted where the surface is continuous."""
         return np.abs(self.shift) * np.where(self.is_continuous, np.float32(REMAINING), np.float32(1))
 
 
-def estimate_camera_blur(
-    modulation: NDArray[np.float32], mask: NDArray[np.bool_], noise: float = 0.0
-) -> NDArray[np.float32]:
+def estimate_camera_blur(modulation: FloatMap, mask: NDArray[np.bool_], noise: float = 0.0) -> FloatMap:
     """Estimate the standard deviation, px, of the camera's point spread: (rows, columns) of `TILES` float32.
 
     From the steepness of the edges of the modulation (h, w) grey levels; the aperture of an ideal pixel where there are
@@ -108,9 +107,7 @@ def estimate_camera_blur(
     return blur
 
 
-def estimate_displacement(
-    phase: NDArray[np.float32], modulation: NDArray[np.float32], noise: float = 0.0
-) -> EdgeDisplacement:
+def estimate_displacement(phase: FloatMap, modulation: FloatMap, noise: float = 0.0) -> EdgeDisplacement:
     """Estimate the displacement of the ``phase`` (h, w) rad by the camera's blur.
 
     ``modulation`` (h, w) grey levels, of standard deviation ``noise``. Depth jumps and glossy edges add errors of their
@@ -129,13 +126,13 @@ def estimate_displacement(
 
 
 def _confirm(
-    phase: NDArray[np.float32],
-    modulation: NDArray[np.float32],
+    phase: FloatMap,
+    modulation: FloatMap,
     displaced: EdgeDisplacement,
     level: NDArray[np.uint8],
     blur: float,
     noise: float,
-) -> NDArray[np.float32]:
+) -> FloatMap:
     """Return the factor (LEVELS,) by which displacements become those of the phase from a straight line.
 
     The line continues the phase of an edge's bright side, from beyond the reach of the ``blur``, px. 0 where too few
@@ -168,7 +165,7 @@ def _confirm(
     return factors if is_confirmed else np.zeros(LEVELS, np.float32)
 
 
-def _compute_weighted_median(values: NDArray[np.float32], weights: NDArray[np.float32]) -> float:
+def _compute_weighted_median(values: FloatMap, weights: FloatMap) -> float:
     """Return the median of values of these weights, all above 0."""
     return float(np.quantile(values, 0.5, weights=weights, method="inverted_cdf"))
 
