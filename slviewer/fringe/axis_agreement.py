@@ -71,7 +71,7 @@ def measure_code_agreement(reader: AxisReader, frames: AxisFrames) -> Agreement:
         return Agreement()
     code, edges, rule = reader.recall(_read_checked_code, frames.bits, frames.inverse, frames.inverted, most=RECENT)
     return Agreement(
-        opposed=_measure_opposition(reader, frames), rule=rule, edges=len(edges.first), unreadable=code.unreadable
+        opposed=_measure_opposition(reader, frames), rule=rule, edges=edges.shape[1], unreadable=code.unreadable
     )
 
 
@@ -88,7 +88,7 @@ def _measure_agreement(reader: AxisReader, frames: AxisFrames) -> Agreement:
         bits = tuple(image if b < missing else None for b, image in enumerate(frames.bits))
         inverse = tuple(image if b < missing else None for b, image in enumerate(frames.inverse))
         code, edges, _ = reader.recall(_read_checked_code, bits, inverse, frames.inverted, most=RECENT)
-    if frames.fringe is not None and len(edges.first) >= FEWEST_EDGES:
+    if frames.fringe is not None and edges.shape[1] >= FEWEST_EDGES:
         result = _add_phase_agreement(reader, frames, code, edges, result)
     return _add_coordinate_range(reader, frames, code, result)
 
@@ -116,21 +116,14 @@ class _Code:
         return self.known == (1 << self.count) - 1
 
 
-@dataclass(frozen=True, eq=False)
-class _Edges:
-    """Code edges: neighbouring pixels whose codes differ by one, as indices into ``_Code.kept``.
-
-    ``first`` (e,): the pixel with the lower code; ``second`` (e,): the pixel with the higher code.
-    """
-
-    first: np.ndarray
-    second: np.ndarray
-
-
 def _read_checked_code(
     reader: AxisReader, bits: Images, inverse: Images, inverted: bool
-) -> tuple[_Code, _Edges, float]:
-    """Return the Gray code, its edges, and the share of the edges that obey the Gray code."""
+) -> tuple[_Code, np.ndarray, float]:
+    """Return the Gray code, its edges, and the share of the edges that obey the Gray code.
+
+    The edges (2, e) are neighbouring pixels whose codes differ by one, as indices into ``_Code.kept``: the pixels with
+    the lower, and those with the higher code.
+    """
     code = _read_code(reader, bits, inverse, inverted)
     rule, edges = _check_code_rule(reader, code)
     return code, edges, rule
@@ -227,7 +220,7 @@ def _locate_unreadable_bit(reader: AxisReader, bits: Sequence[BitReading | None]
     return count if wider or wide or not widths else None
 
 
-def _check_code_rule(reader: AxisReader, code: _Code) -> tuple[float, _Edges]:
+def _check_code_rule(reader: AxisReader, code: _Code) -> tuple[float, np.ndarray]:
     """Return the share of code edges that obey the Gray code, the minimum over all bits, and the edges that obey it."""
     pixels = code.kept
     at = np.flatnonzero(code.gray[1:] != code.gray[:-1])
@@ -248,11 +241,11 @@ def _check_code_rule(reader: AxisReader, code: _Code) -> tuple[float, _Edges]:
                 shares.append(float(weight[of_bit & obeys].sum() / weight[of_bit].sum()))
     at = at[obeys]
     up = code.binary[at + 1] > code.binary[at]
-    return min(shares, default=np.nan), _Edges(np.where(up, at, at + 1), np.where(up, at + 1, at))
+    return min(shares, default=np.nan), np.stack([at + ~up, at + up])
 
 
 def _add_phase_agreement(
-    reader: AxisReader, frames: AxisFrames, code: _Code, edges: _Edges, result: Agreement
+    reader: AxisReader, frames: AxisFrames, code: _Code, edges: np.ndarray, result: Agreement
 ) -> Agreement:
     """Return ``result`` with the agreement of the fringe phase with the code edges added; unchanged without fringes."""
     assert frames.fringe is not None
@@ -260,13 +253,13 @@ def _add_phase_agreement(
     if phasor is None:
         return result
     turned, gaps = reader.unwrapped_phase(frames.fringe[1], frames), reader.gaps
-    first, second = code.kept[edges.first], code.kept[edges.second]
+    first, second = code.kept[edges]
     below, above = phasor[first], phasor[second]
     # Between an edge's pixels, several px apart, a fine fringe turns by more than half a period.
     weight = np.minimum(np.abs(below), np.abs(above)) * (gaps[first] == gaps[second])
     step = turned[second] - turned[first]
     angle = np.angle(below) + step / 2
-    border = code.binary[edges.second].astype(np.float64)
+    border = code.binary[edges[1]].astype(np.float64)
     per_cell = _estimate_turns_per_cell(code, edges, turned, gaps)
     cell = frames.cell_of(code.count)
     common, begin = common_phase(angle, border * cell / frames.fringe[0], weight)
@@ -312,15 +305,15 @@ def fit_turns(angle: np.ndarray, place: np.ndarray, ratios: np.ndarray, weight: 
     return float(ratios[int(np.argmax(lengths))])
 
 
-def _estimate_turns_per_cell(code: _Code, edges: _Edges, angle: np.ndarray, gaps: np.ndarray) -> float:
+def _estimate_turns_per_cell(code: _Code, edges: np.ndarray, angle: np.ndarray, gaps: np.ndarray) -> float:
     """Return the median number of fringe periods between two successive code edges along a line; NaN for too few edges.
 
     ``angle`` (p,): unwrapped phase (rad); ``gaps`` (p,): see `AxisReader.gaps`.
     """
-    here, there = code.kept[edges.first], code.kept[edges.second]
+    here, there = code.kept[edges]
     order = np.argsort(np.minimum(here, there))
     lower_cell, middle = np.minimum(here, there)[order], ((angle[here] + angle[there]) / 2)[order]
-    rising, cell = (there > here)[order], code.binary[edges.second][order]
+    rising, cell = (there > here)[order], code.binary[edges[1]][order]
     consecutive = (
         (rising[1:] == rising[:-1]) & (np.abs(np.diff(cell)) == 1) & (gaps[lower_cell[1:]] == gaps[lower_cell[:-1]])
     )

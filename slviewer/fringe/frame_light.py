@@ -24,7 +24,7 @@ from slviewer.fringe.light_fit import (
     fit_light,
     light_model,
 )
-from slviewer.fringe.light_sample import MIN_PIXELS, LightSample, estimate_albedo, sample_light
+from slviewer.fringe.light_sample import MIN_PIXELS, LightSample, estimate_albedo, list_shifts, sample_light
 from slviewer.fringe.sequence import Indices, PatternSequence
 from slviewer.fringe.suspect import Fault, Suspect
 
@@ -168,7 +168,7 @@ def equalize_frames(
         stack, np.array(chosen), gain[chosen].astype(np.float32), offset[chosen].astype(np.float32),
         along_rows[chosen].astype(np.float32), along_columns[chosen].astype(np.float32), albedo, scale, out,
     )  # fmt: skip
-    for _, steps in (shift for axis in sequence.axes for shift in sequence.phase_shifts(axis)):
+    for steps in list_shifts(sequence):
         if places := [k for k, i in enumerate(chosen) if i in steps]:
             clipped = np.maximum.reduce([stack[chosen[k]] for k in places]) >= white
             for k in places:
@@ -223,16 +223,14 @@ def detect_light_faults(sequence: PatternSequence, light: FrameLight) -> list[Su
             change = 100 * float(light.room[k] - light.room[k - 1])
             more = "brighter" if change > 0 else "darker"
             steps = _count_steps_across_change(sequence, k)
-            outcome = (
-                f"between {steps} phase steps this cannot be corrected reliably; capture again in constant room light"
-                if steps
-                else "corrected; keep the light of the room constant, or switch it off"
-            )
-            observation = (
-                f"the light of the room changed: from frame {k + 1} on the scene is {abs(change):.0f} % {more}"
-            )
-            text = f"{observation}: {outcome}"
-            out.append(Suspect(k, "room-light", text))
+            outcome = "corrected; keep the light of the room constant, or switch it off"
+            if steps:
+                outcome = (
+                    f"between {steps} phase steps this cannot be corrected reliably; capture again in constant room "
+                    "light"
+                )
+            text = f"the light of the room changed: from frame {k + 1} on the scene is {abs(change):.0f} % {more}"
+            out.append(Suspect(k, "room-light", f"{text}: {outcome}"))
     return out
 
 
@@ -242,7 +240,7 @@ def _count_steps_across_change(sequence: PatternSequence, k: int) -> int:
     0 if there is no such period, or if it has enough steps to separate uniform light from light in proportion to the
     albedo.
     """
-    for _, steps in (shift for axis in sequence.axes for shift in sequence.phase_shifts(axis)):
+    for steps in list_shifts(sequence):
         if len(steps) <= FEW_STEPS and min(steps) < k <= max(steps):
             return len(steps)
     return 0

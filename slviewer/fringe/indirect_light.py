@@ -9,8 +9,6 @@ Light that comes from less than a stripe away can be seen by its weak fringes al
 is like that, by nothing.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 from scipy.ndimage import uniform_filter
 
@@ -58,14 +56,6 @@ PLAUSIBLE = (0.4, 1.3)
 """Amplitude of the fringes over half of the white light, also under gamma; another image is no white light."""
 MOST_SPREAD = 0.1
 """Of the samples above the fit: where they scatter more, the image does not show the scene under the same light."""
-
-
-@dataclass(frozen=True, eq=False)
-class _Sampled:
-    """``strength`` (n,): log of the fringes' amplitude over half of the white light; ``terms`` (n, 6) of its model."""
-
-    strength: np.ndarray
-    terms: np.ndarray
 
 
 def mask_indirect_light(task: DecodingTask, maps: Maps) -> None:
@@ -163,9 +153,9 @@ def _detect_weak_fringes(task: DecodingTask, white_frame: np.ndarray, maps: Maps
         return nothing
     some = np.s_[:: max(1, len(rows) // SAMPLES)]
     at = rows[some], columns[some]
-    sampled = _Sampled(strength[at], _model_terms(phase, slope, *at))
-    fit, spread = _fit_strength(sampled)
-    typical = float(np.exp(np.median(sampled.terms @ fit)))
+    terms = _model_terms(phase, slope, *at)
+    fit, spread = _fit_strength(strength[at], terms)
+    typical = float(np.exp(np.median(terms @ fit)))
     if not PLAUSIBLE[0] < typical < PLAUSIBLE[1] or spread > MOST_SPREAD:
         return nothing
     if is_narrow:
@@ -199,23 +189,24 @@ def _square_gradient(phase: np.ndarray, valid: np.ndarray) -> np.ndarray:
     return np.where(known, out, mean)
 
 
-def _fit_strength(sampled: _Sampled) -> tuple[np.ndarray, float]:
+def _fit_strength(strength: np.ndarray, terms: np.ndarray) -> tuple[np.ndarray, float]:
     """Fit the terms (6,) to the upper side of the strengths; second, the mean distance of those above the fit.
 
+    ``strength`` (n,): log of the fringes' amplitude over half of the white light; ``terms`` (n, 6) of its model.
     Penalised, so that place and phase, nearly the same on a flat surface, do not cancel to follow indirect light; blur
     never makes the fringes of a steep surface stronger.
     """
-    middle, size = sampled.terms.mean(axis=0), np.maximum(sampled.terms.std(axis=0), 1e-9)
+    middle, size = terms.mean(axis=0), np.maximum(terms.std(axis=0), 1e-9)
     middle[0], size[0] = 0.0, 1.0
-    terms = (sampled.terms - middle) / size
+    terms = (terms - middle) / size
     weight = np.ones(len(terms))
     for _ in range(20):
         penalty = np.diag(PENALTIES) * weight.sum()
-        normal, moment = (terms.T * weight) @ terms + penalty, (terms.T * weight) @ sampled.strength
+        normal, moment = (terms.T * weight) @ terms + penalty, (terms.T * weight) @ strength
         fit = np.linalg.solve(normal, moment)
         if fit[-1] > 0:
             fit = np.append(np.linalg.solve(normal[:-1, :-1], moment[:-1]), 0.0)
-        rest = sampled.strength - terms @ fit
+        rest = strength - terms @ fit
         weight = np.where(rest > 0, UPPER, 1 - UPPER) / np.maximum(np.abs(rest), 0.005)
     above = rest > 0
     slopes = fit / size

@@ -77,7 +77,7 @@ def sample_light(
         for size, count in ((height, ROWS // 2 if coarse else ROWS), (width, COLUMNS // 4 if coarse else COLUMNS))
     )
     row, column = (grid.ravel() for grid in np.meshgrid(rows, columns, indexing="ij"))
-    shifts = _list_shifts(sequence)
+    shifts = list_shifts(sequence)
     coded = tuple(i for i, f in enumerate(sequence.frames) if f.kind not in ("phase", "texture"))
     used = [*sum(shifts, ()), *coded]
     frames = np.zeros((len(stack), len(row)), np.float32)
@@ -127,7 +127,7 @@ def estimate_albedo(sequence: PatternSequence, frames: np.ndarray, changes: Sequ
     The modulation of a phase shift between whose frames no light ``changes``, or half the range of the coded frames
     between two changes.
     """
-    shifts = _list_shifts(sequence)
+    shifts = list_shifts(sequence)
     if shifts:
         chosen = np.stack([frames[i] for i in shifts[steady_shift(shifts, changes)]]).astype(np.float32)
         return np.abs(fit_cosine(chosen.reshape(len(chosen), -1))[1]).reshape(frames.shape[1:])
@@ -163,7 +163,7 @@ def steady_shift(shifts: Sequence[Sequence[int]], changes: Sequence[int]) -> int
     )
 
 
-def _list_shifts(sequence: PatternSequence) -> tuple[Indices, ...]:
+def list_shifts(sequence: PatternSequence) -> tuple[Indices, ...]:
     """Return the frames of every phase-shifted period, of all axes."""
     return tuple(steps for axis in sequence.axes for _, steps in sequence.phase_shifts(axis))
 

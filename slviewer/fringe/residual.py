@@ -77,8 +77,7 @@ def capture_residuals(
 
     ``readings``: of the stack, new ones if None.
     """
-    light = estimate_frame_light(sequence, stack)
-    frames = _Frames(readings or FrameReadings(sequence, stack), light)
+    frames = _Frames(readings or FrameReadings(sequence, stack), estimate_frame_light(sequence, stack))
     residuals = []
     for axis in sequence.axes:
         with suppress(InputError):  # decoding reports it, with the remedy
