@@ -34,9 +34,12 @@ class SurfaceAgreement:
     log_gain: float | None
 
 
-def compare_views(
-    views: Mapping[str, View], progress: Callable[[float], None]
-) -> dict[tuple[str, str], SurfaceAgreement]:
+Views = Mapping[str, View]
+Agreements = Mapping[tuple[str, str], SurfaceAgreement]
+"""Of overlapping scans, by their names."""
+
+
+def compare_views(views: Views, progress: Callable[[float], None]) -> dict[tuple[str, str], SurfaceAgreement]:
     """Compare every ordered pair of scans; pairs that overlap in too few points are missing from the result."""
     agreements: dict[tuple[str, str], SurfaceAgreement] = {}
     pairs = list(permutations(views, 2))
@@ -88,9 +91,7 @@ def _estimate_log_gain(first: np.ndarray, second: np.ndarray) -> float | None:
     return float(np.median(np.log(second[exposed] / first[exposed])))
 
 
-def colour_gains(
-    views: Mapping[str, View], pairs: Mapping[tuple[str, str], SurfaceAgreement]
-) -> dict[str, float] | None:
+def colour_gains(views: Views, pairs: Agreements) -> dict[str, float] | None:
     """Estimate the factor of each scan's colours that makes overlapping scans agree, least squares of the logarithms.
 
     The mean logarithm is 0. None where a scan has no colours.

@@ -16,7 +16,7 @@ import numpy as np
 from slviewer.errors import InputError
 from slviewer.geometry.rigid import move_points
 from slviewer.reconstruction.cloud import Cloud, choose_pixels
-from slviewer.surface.agreement import SurfaceAgreement, colour_gains, compare_views
+from slviewer.surface.agreement import Agreements, SurfaceAgreement, Views, colour_gains, compare_views
 from slviewer.surface.clean import viewing_cosines
 from slviewer.surface.overlap_kernels import FIELDS, add_surface, add_votes
 from slviewer.surface.shapes import PointSet
@@ -106,9 +106,7 @@ def fuse(
     )
 
 
-def _detect_violations(
-    views: Mapping[str, View], pairs: Mapping[tuple[str, str], SurfaceAgreement], progress: Progress
-) -> dict[str, np.ndarray]:
+def _detect_violations(views: Views, pairs: Agreements, progress: Progress) -> dict[str, np.ndarray]:
     """Detect the points, (h, w) bool by scan, in the free space of more scans than the number that confirm them."""
     witnesses = {name: _select_witnesses(view) for name, view in views.items()}
     violations = {}
@@ -138,7 +136,7 @@ def _select_witnesses(view: View) -> np.ndarray:
     return np.asarray(inside & (view.inner > MIN_WITNESS_WEIGHT) & facing)
 
 
-def _gate_mm(pairs: Mapping[tuple[str, str], SurfaceAgreement], a: str, b: str, first: View, second: View) -> float:
+def _gate_mm(pairs: Agreements, a: str, b: str, first: View, second: View) -> float:
     """Return the gate of two scans by their agreement, or the larger of their point spacings without one."""
     pair = pairs.get((a, b)) or pairs.get((b, a))
     return pair.gate_mm if pair else max(first.spacing, second.spacing)
@@ -146,8 +144,8 @@ def _gate_mm(pairs: Mapping[tuple[str, str], SurfaceAgreement], a: str, b: str, 
 
 def _fuse_scan(
     name: str,
-    views: Mapping[str, View],
-    pairs: Mapping[tuple[str, str], SurfaceAgreement],
+    views: Views,
+    pairs: Agreements,
     gains: Mapping[str, float] | None,
 ) -> tuple[PointSet, np.ndarray]:
     """Average a scan's points with the other scans' surfaces.

@@ -19,7 +19,7 @@ from slviewer.geometry.polynomial import monomials
 from slviewer.geometry.rigid import move_points
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.registration.open3d_loader import open3d
-from slviewer.surface.agreement import colour_gains, compare_views
+from slviewer.surface.agreement import Views, colour_gains, compare_views
 from slviewer.surface.shapes import Mesh, pick_attributes
 from slviewer.surface.topology import face_areas, half_edges
 from slviewer.surface.view import View, prepare_view
@@ -148,7 +148,7 @@ def _bake_places(unfolded: Any, size: int) -> tuple[np.ndarray, np.ndarray]:
 def _blend(
     places: np.ndarray,
     normals: np.ndarray,
-    views: Mapping[str, View],
+    views: Views,
     gains: Mapping[str, float] | None,
     light: np.ndarray | None,
     report: Callable[[float], None],
