@@ -13,7 +13,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from slviewer.fringe.decode import decode
-from slviewer.fringe.patterns import render
+from slviewer.fringe.patterns import render_pattern
 from slviewer.fringe.presets import p18
 from slviewer.pipeline.plan_rig import plan_rig
 
@@ -61,7 +61,7 @@ def draw_phase(path: Path) -> None:
     """Draw fringes, Gray code, wrapped and absolute phase along the first columns of the preset p18."""
     columns = 90
     sequence = p18((912, 64))
-    frames = np.stack([render(sequence, k)[:, :columns] for k in range(len(sequence.frames))])
+    frames = np.stack([render_pattern(sequence, k)[:, :columns] for k in range(len(sequence.frames))])
     phase = decode(sequence, frames, "x").phase[32]
     u = np.arange(columns)
     kinds = [(frame.axis, frame.kind) for frame in sequence.frames]

@@ -57,7 +57,7 @@ if TYPE_CHECKING:
     from slviewer.pipeline.stored_records import load_arrays
     from slviewer.pipeline.verify import verify
     from slviewer.reconstruction.cloud import Cloud
-    from slviewer.reconstruction.reconstruct import reconstruct as reconstruct_cloud
+    from slviewer.reconstruction.reconstruct import reconstruct_cloud
     from slviewer.records.verification import Verification
     from slviewer.registration.multiway import register_all as align_clouds
     from slviewer.report.maps import error_maps as draw_error_maps
@@ -114,7 +114,7 @@ _EXPORTS = {
     "read_captures": "pipeline.import_captures",
     "read_ply": "session.ply",
     "reconstruct": "pipeline.reconstruct",
-    "reconstruct_cloud": "reconstruction.reconstruct:reconstruct",
+    "reconstruct_cloud": "reconstruction.reconstruct",
     "save_calibration": "pipeline.calibrate",
     "texture": "fringe.decode",
     "verify": "pipeline.verify",

@@ -27,7 +27,7 @@ from slviewer.devices.protocols import (
     check_sequence,
 )
 from slviewer.errors import DetectionError, DeviceError, InputError, TurntableError
-from slviewer.fringe.patterns import render
+from slviewer.fringe.patterns import render_pattern as render
 from slviewer.fringe.presets import gray_bits, phase_steps
 from slviewer.fringe.sequence import Frame, PatternSequence, PerAxis
 from slviewer.pipeline.conformance import (

@@ -1,5 +1,6 @@
 """Tests that the frames of one axis pass if their description is correct."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -43,6 +44,11 @@ class Answer:
     contradictions: tuple[Contradiction, ...]
     score: float
     is_certain: bool = False
+
+
+def explain(contradictions: Iterable[Contradiction], a: Agreement) -> Answer:
+    """Return the answer of contradictions with which the frames agree as ``a`` says."""
+    return Answer(tuple(contradictions), sum_shares(a), is_certain(a))
 
 
 def sum_shares(a: Agreement) -> float:
@@ -94,7 +100,7 @@ def failed_tests(frames: AxisFrames, a: Agreement) -> set[str]:
     return failed
 
 
-def is_supported(frames: AxisFrames, a: Agreement) -> bool:
+def has_evidence(frames: AxisFrames, a: Agreement) -> bool:
     """Return whether the frames give positive evidence for a hypothesis, rather than merely no test against it.
 
     Every share that can be measured must exceed ``SURE``, and enough code edges, or several periods, must be in view.
@@ -104,6 +110,11 @@ def is_supported(frames: AxisFrames, a: Agreement) -> bool:
     if np.isfinite(a.common) and not (a.common > SURE and a.rising > SURE):
         return False
     return bool(frames.bits) or (bool(a.level_common) and min(a.level_common) > SURE)
+
+
+def is_proven(frames: AxisFrames, a: Agreement) -> bool:
+    """Return whether the frames fail no test, and give positive evidence as well."""
+    return not failed_tests(frames, a) and has_evidence(frames, a)
 
 
 def wrap(turns: float) -> float:

@@ -15,6 +15,7 @@ import numpy as np
 
 from slviewer.fringe import limits
 from slviewer.fringe.layout import Layout
+from slviewer.fringe.phase import Noise
 from slviewer.fringe.residual_sample import fit_cosine, select_rows
 from slviewer.fringe.suspect import Suspect
 
@@ -67,9 +68,7 @@ class AliasedHarmonics:
         return _compute_correction(theta, self.steps, self.modulation, self.phase).astype(np.float32)
 
 
-def estimate_aliased_harmonics(
-    layout: Layout, stack: np.ndarray, white: float, noise: tuple[float, float]
-) -> AliasedHarmonics:
+def estimate_aliased_harmonics(layout: Layout, stack: np.ndarray, white: float, noise: Noise) -> AliasedHarmonics:
     """Estimate the ripple that harmonics cause in the finest period of an axis; none where it has five or more steps.
 
     ``stack`` (n, h, w) under equal light, which clips at ``white``; ``noise`` (a, b) of its grey levels. About 40,000
@@ -89,12 +88,11 @@ def estimate_aliased_harmonics(
     if not M.is_significant or size / np.sqrt(2) < NOISE_PART * pieces.sigma:
         return none
     n = pieces.steps
-    if d.is_significant and d.value * M.value > 0 and _compute_slope(n, M.value, d.value).min() > 0.1:
-        noise_gain = float(np.mean(_compute_slope(n, M.value, d.value) ** -2.0)) - 1
-        remaining_error = float(
-            np.sqrt((spread**2 + d.error**2 + second**2) / 2 + max(noise_gain, 0.0) * pieces.sigma**2)
-        )
-        return AliasedHarmonics(n, M.value, d.value, True, remaining_error)
+    slope = _compute_slope(n, M.value, d.value)
+    if d.is_significant and d.value * M.value > 0 and slope.min() > 0.1:
+        noise_gain = max(float(np.mean(slope**-2.0)) - 1, 0.0)
+        remaining = np.sqrt((spread**2 + d.error**2 + second**2) / 2 + noise_gain * pieces.sigma**2)
+        return AliasedHarmonics(n, M.value, d.value, True, float(remaining))
     if abs(d.value - M.value) > SIGMAS * d.error + abs(M.value) / 2:  # no phase follows: the modulation is texture's
         return none
     return AliasedHarmonics(n, M.value, d.value, False, abs(M.value) / np.sqrt(2))
@@ -122,16 +120,11 @@ def describe_gamma(harmonics: AliasedHarmonics, layout: Layout) -> list[Suspect]
     per_rad = layout.period_px / (2 * np.pi)
     theta = np.linspace(0, 2 * np.pi, 361)
     largest = float(np.abs(harmonics.correction(theta)).max()) * per_rad
-    remaining = harmonics.error_rad * per_rad
-    treated = (
-        f"corrected, and {remaining:.2g} px was added to the uncertainty"
-        if harmonics.is_corrected
-        else f"it could not be measured well enough to correct it, and {remaining:.2g} px was added to the uncertainty"
-    )
+    outcome = "corrected" if harmonics.is_corrected else "it could not be measured well enough to correct it"
     text = (
-        f"the light does not grow evenly with the grey level (gamma): with {harmonics.steps} phase steps this shifts "
-        f"the coordinates of axis {layout.axis} by up to {largest:.2g} px: {treated}; make the responses of projector "
-        "and camera linear, or use 5 phase steps or more"
+        f"the projector response is nonlinear (gamma): with {harmonics.steps} phase steps this shifts the coordinates "
+        f"of axis {layout.axis} by up to {largest:.2g} px: {outcome}, and {harmonics.error_rad * per_rad:.2g} px was "
+        "added to the uncertainty; make the responses of projector and camera linear, or use 5 phase steps or more"
     )
     return [Suspect(layout.shifts[-1].indices[0], "gamma", text)]
 
@@ -165,11 +158,10 @@ class _Amplitude:
         return abs(self.value) > max(SIGMAS * self.error, CONTROL * abs(self.control))
 
 
-def _cut_pieces(layout: Layout, stack: np.ndarray, white: float, noise: tuple[float, float]) -> _Pieces | None:
+def _cut_pieces(layout: Layout, stack: np.ndarray, white: float, noise: Noise) -> _Pieces | None:
     """Cut rows or columns, whichever cross more fringes, into pieces; None where too few fringes are in view."""
     indices = list(layout.shifts[-1].indices)
-    candidates = [_sample_lines(stack, indices, white, noise)]
-    candidates.append(_sample_lines(stack.transpose(0, 2, 1), indices, white, noise))
+    candidates = [_sample_lines(each, indices, white, noise) for each in (stack, stack.transpose(0, 2, 1))]
     phasor, background, valid, cycles = max(candidates, key=lambda c: c[3])
     if not 0 < cycles < MOST_CYCLES:
         return None
@@ -193,7 +185,7 @@ def _cut_pieces(layout: Layout, stack: np.ndarray, white: float, noise: tuple[fl
 
 
 def _sample_lines(
-    stack: np.ndarray, indices: list[int], white: float, noise: tuple[float, float]
+    stack: np.ndarray, indices: list[int], white: float, noise: Noise
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
     """Return phasor, background and validity (lines, pixels) of some image rows.
 
@@ -281,8 +273,7 @@ def _compute_correction(theta: np.ndarray, n: int, M: float, d: float) -> np.nda
     """
     if M == d == 0:
         return np.zeros_like(theta)
-    wave = np.linspace(-np.pi, np.pi, 1025)
-    error = np.arctan2(-d * np.sin(wave), 1 + M * np.cos(wave))
+    wave, error = _tabulate_ripple(M, d)
     place = n * theta
     place = place - 2 * np.pi * np.rint(place / (2 * np.pi))
     return np.interp(place, np.maximum.accumulate(wave + n * error), -error)
@@ -290,5 +281,11 @@ def _compute_correction(theta: np.ndarray, n: int, M: float, d: float) -> np.nda
 
 def _compute_slope(n: int, M: float, d: float) -> np.ndarray:
     """Return the derivative of the measured argument with respect to the true one, at 1024 points of one wave."""
+    wave, error = _tabulate_ripple(M, d)
+    return np.diff(wave + n * error) / np.diff(wave)
+
+
+def _tabulate_ripple(M: float, d: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return 1025 arguments (rad) of one wave of the ripple, and the errors of the phase (rad) there."""
     wave = np.linspace(-np.pi, np.pi, 1025)
-    return np.diff(wave + n * np.arctan2(-d * np.sin(wave), 1 + M * np.cos(wave))) / np.diff(wave)
+    return wave, np.arctan2(-d * np.sin(wave), 1 + M * np.cos(wave))

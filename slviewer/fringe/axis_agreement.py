@@ -1,11 +1,13 @@
 """Agreement of the frames of one axis with each other, under a hypothesis of what each of them shows."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import zip_longest
 
 import numpy as np
 
 from slviewer.errors import InputError
-from slviewer.fringe.axis_reader import FEWEST_PIXELS, RECENT, AxisFrames, AxisReader
+from slviewer.fringe.axis_reader import FEWEST_PIXELS, RECENT, AxisFrames, AxisReader, BitReading, Images
 from slviewer.fringe.levels import lowest_coordinate, plan_levels, unwrap_levels
 from slviewer.fringe.limits import OUTSIDE_PX
 
@@ -69,7 +71,7 @@ def measure_code_agreement(reader: AxisReader, frames: AxisFrames) -> Agreement:
         return Agreement()
     code, edges, rule = reader.recall(_read_checked_code, frames.bits, frames.inverse, frames.inverted, most=RECENT)
     return Agreement(
-        opposed=_measure_opposition(reader, frames), rule=rule, edges=len(edges.first), unreadable=code.unreadable
+        opposed=_measure_opposition(reader, frames), rule=rule, edges=edges.shape[1], unreadable=code.unreadable
     )
 
 
@@ -81,12 +83,12 @@ def _measure_agreement(reader: AxisReader, frames: AxisFrames) -> Agreement:
     if not frames.bits:
         return _measure_level_agreement(reader, frames, result)
     code, edges, _ = reader.recall(_read_checked_code, frames.bits, frames.inverse, frames.inverted, most=RECENT)
-    if code.known != (1 << code.count) - 1:  # only the bits above the missing one number anything
-        missing = code.count - 1 - ((1 << code.count) - 1 - code.known).bit_length() + 1
+    if not code.is_complete:  # only the bits above the missing one number anything
+        missing = code.count - ((1 << code.count) - 1 - code.known).bit_length()
         bits = tuple(image if b < missing else None for b, image in enumerate(frames.bits))
         inverse = tuple(image if b < missing else None for b, image in enumerate(frames.inverse))
         code, edges, _ = reader.recall(_read_checked_code, bits, inverse, frames.inverted, most=RECENT)
-    if frames.fringe is not None and len(edges.first) >= FEWEST_EDGES:
+    if frames.fringe is not None and edges.shape[1] >= FEWEST_EDGES:
         result = _add_phase_agreement(reader, frames, code, edges, result)
     return _add_coordinate_range(reader, frames, code, result)
 
@@ -108,73 +110,80 @@ class _Code:
     unreadable: int | None
     reach: float = REACH[0]
 
-
-@dataclass(frozen=True, eq=False)
-class _Edges:
-    """Code edges: neighbouring pixels whose codes differ by one, as indices into ``_Code.kept``.
-
-    ``first`` (e,): the pixel with the lower code; ``second`` (e,): the pixel with the higher code.
-    """
-
-    first: np.ndarray
-    second: np.ndarray
+    @property
+    def is_complete(self) -> bool:
+        """Whether all of the first bits have an image."""
+        return self.known == (1 << self.count) - 1
 
 
 def _read_checked_code(
-    reader: AxisReader, bits: tuple[int | None, ...], inverse: tuple[int | None, ...], inverted: bool
-) -> tuple[_Code, _Edges, float]:
-    """Return the Gray code, its edges, and the share of the edges that obey the Gray code."""
+    reader: AxisReader, bits: Images, inverse: Images, inverted: bool
+) -> tuple[_Code, np.ndarray, float]:
+    """Return the Gray code, its edges, and the share of the edges that obey the Gray code.
+
+    The edges (2, e) are neighbouring pixels whose codes differ by one, as indices into ``_Code.kept``: the pixels with
+    the lower, and those with the higher code.
+    """
     code = _read_code(reader, bits, inverse, inverted)
     rule, edges = _check_code_rule(reader, code)
     return code, edges, rule
 
 
-def _read_code(
-    reader: AxisReader, images: tuple[int | None, ...], inverse: tuple[int | None, ...], inverted: bool
-) -> _Code:  # fmt: skip
+def _read_code(reader: AxisReader, images: Images, inverse: Images, inverted: bool) -> _Code:
     """Read the Gray bits, from the most significant one down to the finest that is readable."""
-    bits: list[tuple[np.ndarray, np.ndarray, float, float] | None] = []
-    for b, image in enumerate(images):
-        opposite = inverse[b] if b < len(inverse) else None
-        bits.append(None if image is None and opposite is None else reader.bit(image, opposite))
+    bits = [
+        None if image is opposite is None else reader.bit(image, opposite)
+        for image, opposite in zip_longest(images, inverse)
+    ]
+    count, chosen, unreadable = _choose_readable(reader, bits)
+    if not chosen:
+        return _Code(np.zeros(0, int), np.zeros(0, np.int32), np.zeros(0, np.int32), 0, 0, unreadable)
+    pixels = np.flatnonzero(np.logical_and.reduce([bit.decided for bit in chosen.values()]))
+    gray, known = np.zeros(len(pixels), np.int32), sum(1 << (count - 1 - b) for b in chosen)
+    for b, bit in chosen.items():
+        gray |= bit.value[pixels].astype(np.int32) << (count - 1 - b)
+    if inverted:
+        gray ^= known
+    reach = float(np.clip(chosen[max(chosen)].stripe_px / 3, *REACH))
+    return _Code(pixels, gray, _convert_gray(gray, count), count, known, unreadable, reach)
+
+
+def _choose_readable(
+    reader: AxisReader, bits: Sequence[BitReading | None]
+) -> tuple[int, dict[int, BitReading], int | None]:
+    """Return the number of readable bits, those of them that have an image, by number, and an unreadable one.
+
+    The last is the first bit that should be readable, and is not; None without one.
+    """
     readable = [bit is None or _is_readable(bit) for bit in bits]
     count = readable.index(False) if False in readable else len(bits)
     while count and bits[count - 1] is None:
         count -= 1
     unreadable = _locate_unreadable_bit(reader, bits, count)
-    while True:
-        chosen = [(b, bit) for b, bit in enumerate(bits[:count]) if bit is not None]
-        if not chosen:
-            return _Code(np.zeros(0, int), np.zeros(0, np.int32), np.zeros(0, np.int32), 0, 0, unreadable)
-        decided = np.logical_and.reduce([bit[1] for _, bit in chosen])
-        decided_pixels = np.flatnonzero(decided)
-        if len(decided_pixels) >= MIN_KEPT * len(decided):
+    while chosen := {b: bit for b, bit in enumerate(bits[:count]) if bit is not None}:
+        decided = np.logical_and.reduce([bit.decided for bit in chosen.values()])
+        if np.count_nonzero(decided) >= MIN_KEPT * len(decided):
             break
-        worst = chosen[int(np.argmin([bit[2] for _, bit in chosen]))][0]
-        if worst != chosen[-1][0] or len(chosen) == 1:
-            unreadable = worst if unreadable is None else unreadable
-            break
-        count = chosen[-1][0]  # stripes that blur has almost closed
-    every, known = np.zeros(len(decided), np.int32), 0
-    for b, bit in chosen:
-        every |= bit[0].astype(np.int32) << (count - 1 - b)
-        known |= 1 << (count - 1 - b)
-    gray = (every ^ known if inverted else every)[decided_pixels]
+        worst, finest = min(chosen, key=lambda b: chosen[b].share), max(chosen)
+        if worst != finest or len(chosen) == 1:
+            return count, chosen, worst if unreadable is None else unreadable
+        count = finest  # stripes that blur has almost closed
+    return count, chosen, unreadable
+
+
+def _convert_gray(gray: np.ndarray, count: int) -> np.ndarray:
+    """Return the binary numbers, int32, that Gray codes of ``count`` bits encode."""
     binary = gray.copy()
     shift = 1
     while shift < count:
         binary ^= binary >> shift
         shift *= 2
-    reach = float(np.clip(chosen[-1][1][3] / 3, *REACH))
-    return _Code(decided_pixels, gray, binary, count, known, unreadable, reach)
+    return binary
 
 
-def _is_readable(bit: tuple[np.ndarray, np.ndarray, float, float]) -> bool:
-    """Return whether enough pixels of a bit are decided and its stripes are wide enough.
-
-    ``bit``: value, decided mask, share of decided pixels and mean stripe width in px, see `AxisReader._read_bit`.
-    """
-    return bit[2] > READABLE_SHARE and bit[3] >= READABLE_STRIPE
+def _is_readable(bit: BitReading) -> bool:
+    """Return whether enough pixels of a bit are decided and its stripes are wide enough."""
+    return bit.share > READABLE_SHARE and bit.stripe_px >= READABLE_STRIPE
 
 
 def _measure_opposition(reader: AxisReader, frames: AxisFrames) -> float:
@@ -189,31 +198,29 @@ def _measure_opposition(reader: AxisReader, frames: AxisFrames) -> float:
     readable = [
         b
         for b, pair in enumerate(pairs)
-        if None not in pair and _is_readable(bit := reader.bit(*pair)) and bit[3] >= 1.5 * READABLE_STRIPE
+        if None not in pair and _is_readable(bit := reader.bit(*pair)) and bit.stripe_px >= 1.5 * READABLE_STRIPE
     ]
     shares = [reader.opposed(*pair) for pair in pairs[: max(readable, default=-1) + 1]]
     return min(filter(np.isfinite, shares), default=np.nan)
 
 
-def _locate_unreadable_bit(
-    reader: AxisReader, bits: list[tuple[np.ndarray, np.ndarray, float, float] | None], count: int
-) -> int | None:
+def _locate_unreadable_bit(reader: AxisReader, bits: Sequence[BitReading | None], count: int) -> int | None:
     """Return the index of the first bit that is unreadable although its stripes should be wide.
 
     None if there is none.
     """
     if count == len(bits) or bits[count] is None or len(reader.swing) < FEWEST_PIXELS:
         return None
-    widths = [bit[3] for bit in bits[:count] if bit is not None]
+    widths = [bit.stripe_px for bit in bits[:count] if bit is not None]
     later = [bit for bit in bits[count + 1 :] if bit is not None]
     expected = widths[-1] / 2 if widths else np.inf
-    wider = any(bit[2] > READABLE_SHARE and bit[3] > 2 * READABLE_STRIPE for bit in later)
+    wider = any(bit.share > READABLE_SHARE and bit.stripe_px > 2 * READABLE_STRIPE for bit in later)
     # Few edges in view make a stripe seem wider than it is, by a factor that its neighbours in order share.
     wide = expected > 2 * READABLE_STRIPE and len(widths) >= 2 and widths[-2] < 3 * widths[-1]
     return count if wider or wide or not widths else None
 
 
-def _check_code_rule(reader: AxisReader, code: _Code) -> tuple[float, _Edges]:
+def _check_code_rule(reader: AxisReader, code: _Code) -> tuple[float, np.ndarray]:
     """Return the share of code edges that obey the Gray code, the minimum over all bits, and the edges that obey it."""
     pixels = code.kept
     at = np.flatnonzero(code.gray[1:] != code.gray[:-1])
@@ -234,25 +241,25 @@ def _check_code_rule(reader: AxisReader, code: _Code) -> tuple[float, _Edges]:
                 shares.append(float(weight[of_bit & obeys].sum() / weight[of_bit].sum()))
     at = at[obeys]
     up = code.binary[at + 1] > code.binary[at]
-    return min(shares, default=np.nan), _Edges(np.where(up, at, at + 1), np.where(up, at + 1, at))
+    return min(shares, default=np.nan), np.stack([at + ~up, at + up])
 
 
 def _add_phase_agreement(
-    reader: AxisReader, frames: AxisFrames, code: _Code, edges: _Edges, result: Agreement
-) -> Agreement:  # fmt: skip
+    reader: AxisReader, frames: AxisFrames, code: _Code, edges: np.ndarray, result: Agreement
+) -> Agreement:
     """Return ``result`` with the agreement of the fringe phase with the code edges added; unchanged without fringes."""
     assert frames.fringe is not None
     phasor = reader.phasor(frames.fringe[1], frames)
     if phasor is None:
         return result
     turned, gaps = reader.unwrapped_phase(frames.fringe[1], frames), reader.gaps
-    first, second = code.kept[edges.first], code.kept[edges.second]
+    first, second = code.kept[edges]
     below, above = phasor[first], phasor[second]
     # Between an edge's pixels, several px apart, a fine fringe turns by more than half a period.
     weight = np.minimum(np.abs(below), np.abs(above)) * (gaps[first] == gaps[second])
     step = turned[second] - turned[first]
     angle = np.angle(below) + step / 2
-    border = code.binary[edges.second].astype(np.float64)
+    border = code.binary[edges[1]].astype(np.float64)
     per_cell = _estimate_turns_per_cell(code, edges, turned, gaps)
     cell = frames.cell_of(code.count)
     common, begin = common_phase(angle, border * cell / frames.fringe[0], weight)
@@ -283,15 +290,30 @@ def common_phase(angle: np.ndarray, border_turns: np.ndarray, weight: np.ndarray
     return abs(mean), float((centre / TWO_PI + 0.5) % 1 - 0.5)
 
 
-def _estimate_turns_per_cell(code: _Code, edges: _Edges, angle: np.ndarray, gaps: np.ndarray) -> float:
+def fit_turns(angle: np.ndarray, place: np.ndarray, ratios: np.ndarray, weight: np.ndarray | float = 1.0) -> float:
+    """Return the one of evenly spaced ``ratios`` by which ``place`` predicts ``angle``, (e,) rad each, best.
+
+    The mean unit vector of the difference, weighted by ``weight``, is then the longest.
+    """
+    # From one ratio to the next each unit vector rotates by the same angle.
+    unit = weight * np.exp(1j * (angle - ratios[0] * place))
+    step = np.exp(1j * (ratios[0] - ratios[1]) * place)
+    lengths = []
+    for _ in ratios:
+        lengths.append(abs(complex(unit.sum())))
+        unit *= step
+    return float(ratios[int(np.argmax(lengths))])
+
+
+def _estimate_turns_per_cell(code: _Code, edges: np.ndarray, angle: np.ndarray, gaps: np.ndarray) -> float:
     """Return the median number of fringe periods between two successive code edges along a line; NaN for too few edges.
 
     ``angle`` (p,): unwrapped phase (rad); ``gaps`` (p,): see `AxisReader.gaps`.
     """
-    here, there = code.kept[edges.first], code.kept[edges.second]
+    here, there = code.kept[edges]
     order = np.argsort(np.minimum(here, there))
     lower_cell, middle = np.minimum(here, there)[order], ((angle[here] + angle[there]) / 2)[order]
-    rising, cell = (there > here)[order], code.binary[edges.second][order]
+    rising, cell = (there > here)[order], code.binary[edges[1]][order]
     consecutive = (
         (rising[1:] == rising[:-1]) & (np.abs(np.diff(cell)) == 1) & (gaps[lower_cell[1:]] == gaps[lower_cell[:-1]])
     )
@@ -302,7 +324,7 @@ def _estimate_turns_per_cell(code: _Code, edges: _Edges, angle: np.ndarray, gaps
 
 def _add_coordinate_range(reader: AxisReader, frames: AxisFrames, code: _Code, result: Agreement) -> Agreement:
     """Return ``result`` with the range of the coordinates that the code gives, to within the cells that were read."""
-    if code.known != (1 << code.count) - 1 or len(code.kept) < FEWEST_PIXELS:
+    if not code.is_complete or len(code.kept) < FEWEST_PIXELS:
         return result
     cell = frames.cell_of(code.count)
     return _measure_coordinate_range(
@@ -312,7 +334,7 @@ def _add_coordinate_range(reader: AxisReader, frames: AxisFrames, code: _Code, r
 
 def _measure_coordinate_range(
     coordinate: np.ndarray, weight: np.ndarray, cell: float, extent: int | None, result: Agreement
-) -> Agreement:  # fmt: skip
+) -> Agreement:
     """Return ``result`` with the largest coordinate and the share of coordinates outside the projector.
 
     ``coordinate`` (p,): px at which the cell of each pixel begins; ``weight`` (p,); ``cell``: width of the cells, px.

@@ -3,15 +3,17 @@
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property, lru_cache, partial
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
 from slviewer.fringe.line_sample import LineSample
 from slviewer.fringe.residual_sample import cosine_columns
-from slviewer.fringe.sequence import Axis, Kind, PatternSequence
+from slviewer.fringe.sequence import Axis, PatternSequence
 
 Result = TypeVar("Result")
+Images = tuple[int | None, ...]
+"""Indices of the images of some frames, None where an image is missing."""
 
 DECIDED = 0.2
 """Distance from the middle, as a share of the swing, from which a bit is decided."""
@@ -41,15 +43,15 @@ class AxisFrames:
     offset_rad: float
     origin_px: float
     cell_px: float
-    shifts: tuple[tuple[float, tuple[int | None, ...]], ...]
-    bits: tuple[int | None, ...]
-    inverse: tuple[int | None, ...]
+    shifts: tuple[tuple[float, Images], ...]
+    bits: Images
+    inverse: Images
     complementary: bool
     inverted: bool = False
     gamma: float = 1.0
 
     @property
-    def fringe(self) -> tuple[float, tuple[int | None, ...]] | None:
+    def fringe(self) -> tuple[float, Images] | None:
         """Period (px) and images of the shift that is compared with the Gray code: the one most like its cells.
 
         None for Gray code alone.
@@ -61,23 +63,17 @@ class AxisFrames:
         return self.cell_px * 2.0 ** (len(self.bits) - self.complementary - count)
 
 
-def described_frames(
-    sequence: PatternSequence, axis: Axis, images: Sequence[int | None] | None = None
-) -> AxisFrames:  # fmt: skip
+def described_frames(sequence: PatternSequence, axis: Axis, images: Sequence[int | None] | None = None) -> AxisFrames:
     """Return the frames of an axis as a sequence describes them, frame i being shown in image ``images[i]``.
 
     ``images``: None where an image is missing; frame i is image i if no images are given.
     """
 
-    def list_images(steps: Iterable[int]) -> tuple[int | None, ...]:
+    def list_images(frames: Iterable[int]) -> Images:
         """Return the image of each frame; None for a missing one."""
-        return tuple(i if images is None else images[i] for i in steps)
+        return tuple(i if images is None else images[i] for i in frames)
 
-    def list_images_of_kind(kind: Kind) -> tuple[int | None, ...]:
-        """Return the images of the frames of one kind, sorted by bit."""
-        return list_images(sorted(sequence.find(kind, axis), key=lambda i: sequence.frames[i].bit))
-
-    complementary = list_images_of_kind("complementary")
+    complementary = list_images(sequence.bits("complementary", axis))
     return AxisFrames(
         extent=sequence.extent(axis) if sequence.projector_size else None,
         sign=sequence.sign(axis),
@@ -85,8 +81,8 @@ def described_frames(
         origin_px=sequence.origin_px(axis),
         cell_px=sequence.gray_cell(axis),
         shifts=tuple((period, list_images(steps)) for period, steps in sequence.phase_shifts(axis)),
-        bits=list_images_of_kind("gray") + complementary,
-        inverse=list_images_of_kind("inverse"),
+        bits=list_images(sequence.bits("gray", axis)) + complementary,
+        inverse=list_images(sequence.bits("inverse", axis)),
         complementary=bool(complementary),
     )
 
@@ -98,9 +94,20 @@ def reversed_bits(frames: AxisFrames, with_complementary: bool = False) -> AxisF
     """
     if with_complementary:
         return replace(frames, bits=frames.bits[::-1])
-    last = frames.bits[len(frames.bits) - frames.complementary :]
-    gray = frames.bits[: len(frames.bits) - frames.complementary]
-    return replace(frames, bits=(*gray[::-1], *last), inverse=frames.inverse[::-1])
+    count = len(frames.bits) - frames.complementary
+    return replace(frames, bits=frames.bits[:count][::-1] + frames.bits[count:], inverse=frames.inverse[::-1])
+
+
+class BitReading(NamedTuple):
+    """Bit as it is read from its images.
+
+    ``value`` and ``decided`` (p,) bool; ``share`` of decided pixels; ``stripe_px``: mean width of the stripes.
+    """
+
+    value: np.ndarray
+    decided: np.ndarray
+    share: float
+    stripe_px: float
 
 
 class AxisReader:
@@ -178,11 +185,10 @@ class AxisReader:
         share = float(weight[(first > 0) != (second > 0)].sum() / max(float(weight.sum()), 1e-9))
         return share if np.count_nonzero(inside) >= FEWEST_PIXELS else np.nan
 
-    def _read_bit(self, image: int | None, inverse: int | None) -> tuple[np.ndarray, np.ndarray, float, float]:
-        """Return value and decided mask of a bit, (p,) bool each, its share of decided pixels, and its stripe width.
+    def _read_bit(self, image: int | None, inverse: int | None) -> BitReading:
+        """Read a bit from its image and its inverse.
 
-        ``image`` and ``inverse``: None where missing; the middle of each pixel's darkest and brightest level stands in
-        for it. The stripe width is the mean in px.
+        None where one is missing; the middle of each pixel's darkest and brightest level stands in for it.
         """
         high = self.middle if image is None else self.frames[image]
         low = self.middle if inverse is None else self.frames[inverse]
@@ -191,7 +197,8 @@ class AxisReader:
         noise = self._sample.noise * (0.71 if both else 1.0)
         decided = np.abs(height) > np.maximum(DECIDED * self.swing, DECIDED_SIGMAS * noise)
         value = height > 0
-        return value, decided, float(decided.mean()) if decided.size else 0.0, self._measure_stripe_width(value)
+        share = float(decided.mean()) if decided.size else 0.0
+        return BitReading(value, decided, share, self._measure_stripe_width(value))
 
     def _measure_stripe_width(self, value: np.ndarray) -> float:
         """Return the mean stripe width in px along the rows or along the columns, whichever is smaller."""
@@ -202,7 +209,7 @@ class AxisReader:
         parts = ((across, edges_across), (len(self._across) - across, edges_along))
         return min((pixels / (1 + crossed) for pixels, crossed in parts if pixels), default=0.0)
 
-    def phasor(self, images: tuple[int | None, ...], frames: AxisFrames) -> np.ndarray | None:
+    def phasor(self, images: Images, frames: AxisFrames) -> np.ndarray | None:
         """Return modulation * e^(i phase), (p,) complex64; None with fewer than three of the steps."""
         wave = self._wave(images, frames.gamma)
         if wave is None:
@@ -210,14 +217,14 @@ class AxisReader:
         turned = np.exp(-1j * frames.offset_rad).astype(np.complex64)
         return (wave if frames.sign < 0 else np.conj(wave)) * turned
 
-    def unwrapped_phase(self, images: tuple[int | None, ...], frames: AxisFrames) -> np.ndarray:
+    def unwrapped_phase(self, images: Images, frames: AxisFrames) -> np.ndarray:
         """Return the phase (p,) in rad, unwrapped from pixel to pixel along each line.
 
         ``images``: steps that have a `phasor`.
         """
         return -frames.sign * self._unwrapped(images, frames.gamma)
 
-    def _fit_wave(self, images: tuple[int | None, ...], gamma: float) -> np.ndarray | None:
+    def _fit_wave(self, images: Images, gamma: float) -> np.ndarray | None:
         """Fit `phasor` (p,) complex64 for a negative phase sign and without offset; None for fewer than three steps."""
         steps = [k for k, image in enumerate(images) if image is not None]
         there = [image for image in images if image is not None]
@@ -235,7 +242,7 @@ class AxisReader:
         wave.real, wave.imag = cosine, sine
         return wave
 
-    def _unwrap_wave(self, images: tuple[int | None, ...], gamma: float) -> np.ndarray:
+    def _unwrap_wave(self, images: Images, gamma: float) -> np.ndarray:
         """Compute `unwrapped_phase` (p,) for a negative phase sign."""
         wave = self._wave(images, gamma)
         assert wave is not None

@@ -3,12 +3,12 @@
 import numpy as np
 
 from slviewer.fringe import kernels, kernels_coded, kernels_gray, kernels_levels, kernels_spikes, limits
-from slviewer.fringe.frame_light import CLIPPED, FrameLight, equalize_axis
+from slviewer.fringe.decoding_task import prepare_decoding
+from slviewer.fringe.frame_light import FrameLight
 from slviewer.fringe.kernels_spikes import spike_rules
-from slviewer.fringe.layout import Layout, axis_layout, check_stack, white_level
+from slviewer.fringe.layout import Layout, axis_layout, check_stack
 from slviewer.fringe.levels import cell_misfit, code_cell_px, layout_levels, lowest_coordinate, unambiguous_px
-from slviewer.fringe.noise import measure_noise
-from slviewer.fringe.phase import PhaseMap
+from slviewer.fringe.phase import Noise, PhaseMap
 from slviewer.fringe.reference import code_bits, complete_map, dark_sigmas, decode_reference, phase_shift
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.fringe.threshold import MIDDLE, fringe_mean
@@ -17,9 +17,13 @@ __all__ = ["decode", "decode_reference", "texture"]
 
 
 def decode(
-    sequence: PatternSequence, stack: np.ndarray, axis: Axis, light: FrameLight | None = None, *,
+    sequence: PatternSequence,
+    stack: np.ndarray,
+    axis: Axis,
+    light: FrameLight | None = None,
+    *,
     mask_indirect: bool = True,
-) -> PhaseMap:  # fmt: skip
+) -> PhaseMap:
     """Decode the phase map of one axis from the (n, h, w) uint8 or uint16 frames of a sequence.
 
     A pixel is masked, with a reason, rather than given a doubtful phase. Where the light differed between the
@@ -28,16 +32,9 @@ def decode(
     estimated if None. ``mask_indirect``: mask pixels of much indirect light, see `indirect_light`. Raises
     InputError when the frames are not those of the sequence, or cannot give an absolute phase.
     """
-    check_stack(sequence, stack)
-    layout = axis_layout(sequence, axis)
-    stack = np.ascontiguousarray(stack)
-    white = white_level(sequence, stack, sequence.select(axis))
-    sequence, stack, factor = equalize_axis(sequence, stack, axis, light)
-    if factor != 1:
-        layout = axis_layout(sequence, axis)
-    clipped = white if factor == 1 else CLIPPED
-    noise = measure_noise(layout, stack, clipped)
-    scale = grey_scale(layout, noise, white * factor)._replace(white=clipped)
+    task = prepare_decoding(sequence, stack, axis, light)
+    layout, stack = task.layout, task.stack
+    scale = grey_scale(layout, task.noise, task.full_scale)._replace(white=task.white)
     maps = tuple(np.empty(stack.shape[1:], dtype) for dtype in (*[np.float32] * 4, np.uint8))
     if not layout.shifts:
         kernels_gray.decode_gray(stack, scale, _pack_gray_rules(layout), maps)
@@ -48,7 +45,7 @@ def decode(
         ladder = pack_levels(layout, fringe_mean(layout, stack) if layout.gray else MIDDLE)
         kernels_levels.decode_levels(stack, pack_shifts(layout), ladder, scale, maps)
     _repair_spikes(layout, maps[0], maps[-1])
-    return complete_map(sequence, layout, stack, clipped, maps, noise, factor, mask_indirect)
+    return complete_map(task, maps, mask_indirect)
 
 
 def texture(sequence: PatternSequence, stack: np.ndarray) -> np.ndarray:
@@ -80,7 +77,7 @@ def _repair_spikes(layout: Layout, phase: np.ndarray, reason: np.ndarray) -> Non
     kernels_spikes.mask_phases(*lists, phase, reason)
 
 
-def grey_scale(layout: Layout, noise: tuple[float, float], white: float) -> kernels.Scale:
+def grey_scale(layout: Layout, noise: Noise, white: float) -> kernels.Scale:
     """Return the grey levels that decide about a pixel, from the noise (a, b) and the clipping level ``white``."""
     return kernels.Scale(*noise, limits.DARK_LEVELS * white / 255, dark_sigmas(layout), white)
 

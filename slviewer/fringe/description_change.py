@@ -11,13 +11,12 @@ from slviewer.fringe.agreement_tests import (
     MAX_OUTSIDE,
     SURE,
     Answer,
+    explain,
     failed_tests,
-    is_certain,
-    is_supported,
-    sum_shares,
+    has_evidence,
     wrap,
 )
-from slviewer.fringe.axis_agreement import FEWEST_EDGES, Agreement, common_phase, measure_agreement
+from slviewer.fringe.axis_agreement import FEWEST_EDGES, Agreement, common_phase, fit_turns, measure_agreement
 from slviewer.fringe.axis_reader import AxisFrames, AxisReader, described_frames, reversed_bits
 from slviewer.fringe.contradiction import Contradiction
 from slviewer.fringe.sequence import Axis, PatternSequence
@@ -35,43 +34,37 @@ def explain_axis(reader: AxisReader, sequence: PatternSequence, axis: Axis) -> l
     """
     answers: list[Answer] = []
     for variant, changes in _list_variants(described_frames(sequence, axis), axis):
-        explain = _fit_code_values if variant.bits else _fit_level_offset
-        answer = explain(reader, variant, axis, changes)
+        fit = _fit_code_values if variant.bits else _fit_level_offset
+        answer = fit(reader, variant, axis, changes)
         if answer is not None:
             answers.append(answer)
     if not answers:
         return []
-    fewest = min(_count_changes(answer) for answer in answers)
-    answers = sorted((a for a in answers if _count_changes(a) == fewest), key=lambda a: -a.score)
+    first, *others = sorted(answers, key=lambda answer: (len(answer.contradictions), -answer.score))
     # Several gammas fit more or less: only the best of them is returned.
-    first = answers[0].contradictions[0].cause
     return [
-        answers[0],
-        *(a for a in answers[1:] if a.contradictions[0].cause != first and a.score > answers[0].score - CLEARLY),
+        first,
+        *(
+            answer
+            for answer in others
+            if len(answer.contradictions) == len(first.contradictions)
+            and answer.contradictions[0].cause != first.contradictions[0].cause
+            and answer.score > first.score - CLEARLY
+        ),
     ]
-
-
-def _count_changes(answer: Answer) -> int:
-    """Return the number of changes that an answer makes to the description."""
-    return len(answer.contradictions)
 
 
 def _list_variants(frames: AxisFrames, axis: Axis) -> Iterator[tuple[AxisFrames, list[Contradiction]]]:
     """Yield variants of the description (bit order, phase sign, gamma) and the contradictions that each stands for."""
-    bits: list[tuple[AxisFrames, list[Contradiction]]] = [(frames, [])]
+    bits = [(frames, "")]
     if len(frames.bits) - frames.complementary > 1:
-        text = f"the Gray bits of axis {axis} are in reverse order, the finest stripes first: reverse the bit numbers"
-        bits.append((reversed_bits(frames), [Contradiction("bit-order", text, axis, None)]))
+        bits.append((reversed_bits(frames), "in reverse order, the finest stripes first: reverse the bit numbers"))
         if frames.complementary:
-            text = (
-                f"the Gray bits of axis {axis} are in reverse order, the complementary bit first: reverse the numbers "
-                "of all of them"
-            )
-            bits.append((reversed_bits(frames, True), [Contradiction("bit-order", text, axis, None)]))
-        text = f"the Gray bits of axis {axis} are inverted: exchange each bit with its inverse"
-        inverted = replace(frames, inverted=True)
-        bits.append((inverted, [Contradiction("bit-order", text, axis, None)]))
-    for variant, changes in bits:
+            text = "in reverse order, the complementary bit first: reverse the numbers of all of them"
+            bits.append((reversed_bits(frames, True), text))
+        bits.append((replace(frames, inverted=True), "inverted: exchange each bit with its inverse"))
+    for variant, text in bits:
+        changes = [Contradiction("bit-order", f"the Gray bits of axis {axis} are {text}", axis, None)] if text else []
         yield variant, changes
         if frames.shifts:
             flipped = replace(variant, sign=-variant.sign)
@@ -90,9 +83,7 @@ def _list_variants(frames: AxisFrames, axis: Axis) -> Iterator[tuple[AxisFrames,
             yield replace(frames, gamma=gamma), [Contradiction("gamma", text, axis, gamma)]
 
 
-def _fit_code_values(
-    reader: AxisReader, frames: AxisFrames, axis: Axis, changes: list[Contradiction]
-) -> Answer | None:  # fmt: skip
+def _fit_code_values(reader: AxisReader, frames: AxisFrames, axis: Axis, changes: list[Contradiction]) -> Answer | None:
     """Fit cell width, offsets and size to frames with Gray bits; return the changes with which all tests pass.
 
     ``changes``: those that the variant ``frames`` already makes. None if no values fit, or if nothing changes.
@@ -135,7 +126,7 @@ def _fit_code_values(
             out += _describe_phase_shift(frames, a, late, axis)
     if a.outside > MAX_OUTSIDE:
         out += explain_reach(frames, a, axis)
-    return Answer(tuple(out), sum_shares(a), is_certain(a)) if out else None
+    return explain(out, a) if out else None
 
 
 def _fit_cell_width(frames: AxisFrames, a: Agreement) -> tuple[float, float, float]:
@@ -146,16 +137,8 @@ def _fit_cell_width(frames: AxisFrames, a: Agreement) -> tuple[float, float, flo
     assert frames.fringe is not None and a.borders is not None
     angle, border, weight = a.borders
     turns = a.turns_per_cell if np.isfinite(a.turns_per_cell) else frames.cell_px / frames.fringe[0]
-    ratios = np.arange(0.88, 1.121, 0.0005) * turns
-    # From one ratio to the next each unit vector rotates by the same angle.
-    unit = weight * np.exp(1j * (angle - 2 * np.pi * border * ratios[0]))
-    step = np.exp(2j * np.pi * border * (ratios[0] - ratios[1]))
-    lengths = []
-    for _ in ratios:
-        lengths.append(abs(complex(unit.sum())))
-        unit *= step
-    ratio = ratios[int(np.argmax(lengths))]
-    return (float(ratio * frames.fringe[0]), *common_phase(angle, border * ratio, weight))
+    ratio = fit_turns(angle, 2 * np.pi * border, np.arange(0.88, 1.121, 0.0005) * turns, weight)
+    return (ratio * frames.fringe[0], *common_phase(angle, border * ratio, weight))
 
 
 def _describe_phase_shift(frames: AxisFrames, a: Agreement, late: float, axis: Axis) -> list[Contradiction]:
@@ -170,8 +153,7 @@ def _describe_phase_shift(frames: AxisFrames, a: Agreement, late: float, axis: A
     share = describe_turns(2 * np.pi * late)
     shifted = Contradiction(
         "phase-offset",
-        f"the phase steps of axis {axis} begin {share} than described: set phase_offset = {offset:.3f} (rad; "
-        "of a PatternSequence: phase_offset_rad)",
+        f"the phase steps of axis {axis} begin {share} than described: {_describe_offset(offset)}",
         axis,
         offset,
     )
@@ -206,19 +188,19 @@ def explain_reach(frames: AxisFrames, a: Agreement, axis: Axis) -> list[Contradi
 
 def _fit_level_offset(
     reader: AxisReader, frames: AxisFrames, axis: Axis, changes: list[Contradiction]
-) -> Answer | None:  # fmt: skip
+) -> Answer | None:
     """Fit the phase offset to frames of several periods without Gray bits; return the changes, None without any."""
     a = measure_agreement(reader, frames)
     failed = failed_tests(frames, a)
-    if "levels" in failed or not is_supported(frames, a):
+    if "levels" in failed or not has_evidence(frames, a):
         return None
     if not failed:
-        return Answer(tuple(changes), sum_shares(a), is_certain(a)) if changes else None
+        return explain(changes, a) if changes else None
     if failed == {"outside"}:
-        return Answer((*changes, *explain_reach(frames, a, axis)), sum_shares(a), is_certain(a))
+        return explain((*changes, *explain_reach(frames, a, axis)), a)
     steps = len(frames.shifts[-1][1])
     best: tuple[float, AxisFrames, Agreement] | None = None
-    for turns in (0.25, -0.25, 0.5, *(wrap(k / steps) for k in range(1, steps))):
+    for turns in step_turns(steps):
         turned = replace(frames, offset_rad=frames.offset_rad + 2 * np.pi * turns)
         b = measure_agreement(reader, turned)
         apart = max(map(abs, b.level_turns))
@@ -228,14 +210,24 @@ def _fit_level_offset(
         return None
     offset = wrap(best[1].offset_rad / (2 * np.pi)) * 2 * np.pi
     text = f"the phase steps of axis {axis} begin {describe_turns(offset - frames.offset_rad)} than described"
+    out = Contradiction("phase-offset", f"{text}: {_describe_offset(offset)}", axis, offset)
     if changes:  # a sign and an offset: the steps in reverse order
-        text = f"the {steps} phase steps of axis {axis} are in reverse order, or"
-        cure = f"set phase_sign = {frames.sign} and phase_offset = {offset:.3f} for axis {axis}"
-        out = Contradiction("step-order", f"{text} begin elsewhere: {cure}", axis, float(frames.sign))
-        return Answer((out,), sum_shares(best[2]), is_certain(best[2]))
-    cure = f"set phase_offset = {offset:.3f} (rad; of a PatternSequence: phase_offset_rad)"
-    out = Contradiction("phase-offset", f"{text}: {cure}", axis, offset)
-    return Answer((out,), sum_shares(best[2]), is_certain(best[2]))
+        text = (
+            f"the {steps} phase steps of axis {axis} are in reverse order, or begin elsewhere: set phase_sign = "
+            f"{frames.sign} and phase_offset = {offset:.3f} for axis {axis}"
+        )
+        out = Contradiction("step-order", text, axis, float(frames.sign))
+    return explain([out], best[2])
+
+
+def _describe_offset(offset: float) -> str:
+    """Return the remedy of a wrong phase offset."""
+    return f"set phase_offset = {offset:.3f} (rad; of a PatternSequence: phase_offset_rad)"
+
+
+def step_turns(steps: int) -> tuple[float, ...]:
+    """Return the usual offsets of a phase, in periods: quarters, a half, and whole steps."""
+    return (0.25, -0.25, 0.5, *(wrap(k / steps) for k in range(1, steps)))
 
 
 def describe_turns(angle: float) -> str:

@@ -10,12 +10,12 @@ from functools import cached_property
 
 import numpy as np
 
-from slviewer.fringe.agreement_tests import failed_tests, is_supported, sum_shares
+from slviewer.fringe.agreement_tests import failed_tests, is_proven, sum_shares
 from slviewer.fringe.axis_agreement import Agreement, estimate_coordinates, measure_agreement
-from slviewer.fringe.axis_reader import AxisReader, described_frames
+from slviewer.fringe.axis_reader import AxisFrames, AxisReader, described_frames
 from slviewer.fringe.contradiction import Contradiction
 from slviewer.fringe.description_change import CLEARLY, LINES, explain_axis
-from slviewer.fringe.frame_light import describe_disturbance, equalize_frames, estimate_frame_light
+from slviewer.fringe.frame_light import FrameLight, describe_disturbance, equalize_frames, estimate_frame_light
 from slviewer.fringe.frame_likeness import FrameLikeness
 from slviewer.fringe.frame_order import StepReader, detect_copies, search_order
 from slviewer.fringe.layout import check_stack
@@ -62,6 +62,11 @@ class FrameReadings:
         return FrameLikeness(self.sequence, self.sample)
 
     @cached_property
+    def steps(self) -> StepReader:
+        """The check of the phase steps."""
+        return StepReader(self.sequence, self.sample)
+
+    @cached_property
     def copies(self) -> tuple[Contradiction, ...]:
         """Contradictions of frames that repeat others; empty if none do."""
         return detect_copies(self.sequence, self.readers, self.likeness)
@@ -101,11 +106,15 @@ def check_description(
         # Misplaced frames distort the estimate of the light: an explanation of the frames as they are has priority.
         if not under_equal_light or not is_explained:
             contradictions = under_equal_light
-    if any(contradiction.cause not in ("unreadable", "duplicate-frame") for contradiction in contradictions):
+    causes = {contradiction.cause for contradiction in contradictions}
+    if not causes or causes - {"unreadable", "duplicate-frame"}:
         return contradictions
-    if not contradictions:
-        return ()
-    sample = readings.sample
+    return _explain_by_light(readings, light) or contradictions
+
+
+def _explain_by_light(readings: FrameReadings, light: FrameLight) -> tuple[Contradiction, ...]:
+    """Return the contradiction of saturated frames, or of unsteady light; empty if neither explains the frames."""
+    sequence, sample = readings.sequence, readings.sample
     coded = coded_frames(sequence)
     illuminated = sample.swing(coded) > sample.least_swing
     clipped = np.array([float(np.mean(sample.frames[i][illuminated] >= sample.white)) for i in coded])
@@ -114,7 +123,7 @@ def check_description(
     terms = light.terms or light.unexplained
     if unsteady > UNSTEADY and terms and not (saturated and saturated.cause == "room-light"):
         return (Contradiction(*describe_disturbance(terms), None, unsteady),)
-    return (saturated,) if saturated else contradictions
+    return (saturated,) if saturated else ()
 
 
 def _describe_saturation(coded: list[int], clipped: np.ndarray) -> Contradiction:
@@ -161,41 +170,66 @@ def find_contradictions(readings: FrameReadings, *, with_steps: bool = True) -> 
     sequence = readings.sequence
     if not sequence.axes:
         return ()
-    sample = readings.sample
-    if dark := _detect_missing_pattern(sequence, sample):
-        return dark
-    if readings.copies:
-        return readings.copies
-    readers, likeness, stated = readings.readers, readings.likeness, readings.stated
-    failed = {axis: failed_tests(described_frames(sequence, axis), stated[axis]) for axis in sequence.axes}
-    steps = StepReader(sequence, sample)
-    disordered = [c for axis in sequence.axes if with_steps for c in steps.detect_misplaced_steps(axis)]
-    strange = steps.detect_unexplained_steps() if with_steps and not disordered else set()
-    uneven = [i for i in range(len(readings.stack)) if not likeness.is_even(i, i)]
-    if not any(failed.values()) and not disordered and not strange and not uneven:
+    if found := _detect_missing_pattern(sequence, readings.sample) or readings.copies:
+        return found
+    failed = {axis: failed_tests(described_frames(sequence, axis), a) for axis, a in readings.stated.items()}
+    disordered, strange = _check_steps(readings) if with_steps else ([], set())
+    uneven = _detect_uneven_frames(readings)
+    if not (any(failed.values()) or disordered or strange or uneven):
         return readings.mirroring
     if disordered and all(contradiction.cause in _OF_STEPS for contradiction in disordered):
         return tuple(disordered)  # steps of one period, which are explained completely
-    if exchanged := _detect_exchanged_axes(sequence, sample, failed):
-        return exchanged
-    answers = {axis: explain_axis(readers[axis], sequence, axis) for axis in sequence.axes if failed[axis]}
-    explained = [answers[axis][0].score if answers.get(axis) else sum_shares(stated[axis]) for axis in sequence.axes]
-    complete = all(answers.values()) and not disordered and not strange and not uneven
-    if not (complete and all(answers[axis][0].is_certain for axis in answers)):
-        order = search_order(sequence, readers, steps, likeness, disordered)
+    if found := _detect_exchanged_axes(sequence, readings.sample, failed):
+        return found
+    return _explain_failed_tests(readings, failed, disordered, uneven, not (disordered or strange or uneven))
+
+
+def _explain_failed_tests(
+    readings: FrameReadings,
+    failed: dict[Axis, set[str]],
+    disordered: list[Contradiction],
+    uneven: list[Contradiction],
+    is_ordered: bool,
+) -> tuple[Contradiction, ...]:
+    """Return the changes of the description, or the order of the frames, that explain the ``failed`` tests best.
+
+    ``disordered``, ``uneven``: contradictions of the phase steps, and of white and black frames; ``is_ordered``:
+    whether all frames are in their place.
+    """
+    sequence, stated = readings.sequence, readings.stated
+    answers = {axis: explain_axis(readings.readers[axis], sequence, axis) for axis in sequence.axes if failed[axis]}
+    complete = is_ordered and all(answers.values())
+    if not (complete and all(found[0].is_certain for found in answers.values())):
+        explained = [
+            answers[axis][0].score if answers.get(axis) else sum_shares(stated[axis]) for axis in sequence.axes
+        ]
+        order = search_order(sequence, readings.readers, readings.steps, readings.likeness, disordered)
         if order is not None and not (complete and sum(explained) > order.score - CLEARLY):
             return order.contradictions
     out = list(disordered)
-    for axis in sequence.axes:
-        if answers.get(axis):
-            out += [contradiction for answer in answers[axis] for contradiction in answer.contradictions]
-        elif failed[axis] and not disordered:
+    for axis, found in answers.items():
+        if found:
+            out += [contradiction for answer in found for contradiction in answer.contradictions]
+        elif not disordered:
             out.append(_describe_failed_tests(axis, stated[axis], failed[axis]))
-    for i in uneven:
-        kind = sequence.frames[i].kind
-        text = f"frame {i + 1} should be {kind}, and is not: put the frames in order, or capture again"
-        out.append(Contradiction("frame-order", text, None, float(i)))
-    return tuple(dict.fromkeys(out))
+    return tuple(dict.fromkeys(out + uneven))
+
+
+def _check_steps(readings: FrameReadings) -> tuple[list[Contradiction], set[int]]:
+    """Return the contradictions of phase steps out of order, and, without any, the frames that no step explains."""
+    steps = readings.steps
+    disordered = [c for axis in readings.sequence.axes for c in steps.detect_misplaced_steps(axis)]
+    return disordered, set() if disordered else steps.detect_unexplained_steps()
+
+
+def _detect_uneven_frames(readings: FrameReadings) -> list[Contradiction]:
+    """Return the contradictions of white and black frames that are not."""
+    out = []
+    for i, frame in enumerate(readings.sequence.frames):
+        if not readings.likeness.is_even(i, i):
+            text = f"frame {i + 1} should be {frame.kind}, and is not: put the frames in order, or capture again"
+            out.append(Contradiction("frame-order", text, None, float(i)))
+    return out
 
 
 def _detect_missing_pattern(sequence: PatternSequence, sample: LineSample) -> tuple[Contradiction, ...]:
@@ -206,26 +240,16 @@ def _detect_missing_pattern(sequence: PatternSequence, sample: LineSample) -> tu
     if share >= LEAST_ILLUMINATED:
         return ()
     clipped, modulation = float(np.mean(low >= sample.white)), float(np.quantile(high - low, 0.99)) / 2
-    seen_text = f"{100 * share:.1f} % of the pixels carry a readable pattern"
+    text = f"{100 * share:.1f} % of the pixels carry a readable pattern"
     if clipped > MOSTLY:
-        return (
-            Contradiction(
-                "saturation",
-                f"{seen_text}, and {100 * clipped:.0f} % are saturated in all frames: lower the exposure or the gain, "
-                "and capture again",
-                None,
-                clipped,
-            ),
-        )
-    return (
-        Contradiction(
-            "dark",
-            f"{seen_text}; the modulation is {modulation:.1f} of {sample.white:.0f} grey levels: raise the exposure or "
-            "the projector's brightness, and check that the projector showed the patterns",
-            None,
-            modulation,
-        ),
+        remedy = "lower the exposure or the gain, and capture again"
+        text += f", and {100 * clipped:.0f} % are saturated in all frames: {remedy}"
+        return (Contradiction("saturation", text, None, clipped),)
+    text += (
+        f"; the modulation is {modulation:.1f} of {sample.white:.0f} grey levels: raise the exposure or the "
+        "projector's brightness, and check that the projector showed the patterns"
     )
+    return (Contradiction("dark", text, None, modulation),)
 
 
 def _detect_exchanged_axes(
@@ -240,35 +264,30 @@ def _detect_exchanged_axes(
     reader = AxisReader(sample, coded_frames(sequence))
     x, y = (described_frames(sequence, axis) for axis in ("x", "y"))
     steps = [[(period, len(images)) for period, images in frames.shifts] for frames in (x, y)]
-    for with_steps, with_bits in ((True, True), (True, False), (False, True)):
-        can_differ = x.bits and y.bits and steps[0] and steps[0] == steps[1] and len(x.bits) == len(y.bits)
-        if with_steps != with_bits and not can_differ:
+    can_differ = x.bits and y.bits and steps[0] and steps[0] == steps[1] and len(x.bits) == len(y.bits)
+    for which in ("frames", "phase steps", "Gray frames") if can_differ else ("frames",):
+        variants = [_exchange_frames(own, other, which) for own, other in ((x, y), (y, x))]
+        if not all(is_proven(variant, measure_agreement(reader, variant)) for variant in variants):
             continue
-        variants = []
-        for frames, other in ((x, y), (y, x)):
-            if with_steps and with_bits:
-                variants.append(replace(other, extent=frames.extent))
-            elif with_steps:
-                variants.append(replace(frames, shifts=other.shifts))
-            else:
-                variants.append(replace(frames, bits=other.bits, inverse=other.inverse))
-        agreements = [measure_agreement(reader, variant) for variant in variants]
-        if any(
-            failed_tests(variant, a) or not is_supported(variant, a)
-            for variant, a in zip(variants, agreements, strict=True)
-        ):
-            continue
-        if with_steps and with_bits:
+        if which == "frames":
             return (
                 _describe_exchanged_axes("the codes along x fit the projector's rows, and those along y its columns"),
             )
-        which = "phase steps" if with_steps else "Gray frames"
         text = (
             f"x and y are exchanged in the {which} alone, which fit the other frames of the other axis: exchange the "
             f"{which} of x and y in the description"
         )
         return (Contradiction("axes-swapped", text, None, None),)
     return ()
+
+
+def _exchange_frames(own: AxisFrames, other: AxisFrames, which: str) -> AxisFrames:
+    """Return the frames of an axis with all "frames", the "phase steps", or the "Gray frames" of the other axis."""
+    if which == "frames":
+        return replace(other, extent=own.extent)
+    if which == "phase steps":
+        return replace(own, shifts=other.shifts)
+    return replace(own, bits=other.bits, inverse=other.inverse)
 
 
 def _describe_exchanged_axes(observation: str) -> Contradiction:
@@ -320,22 +339,21 @@ def _detect_mirroring(sequence: PatternSequence, sample: LineSample) -> tuple[Co
 
 def _describe_failed_tests(axis: Axis, a: Agreement, failed: set[str]) -> Contradiction:
     """Return the contradiction that reports the failed tests of an axis where no hypothesis explains them."""
-    if "bits" in failed:
-        observation = f"Gray bit {a.unreadable} of axis {axis} cannot be read though its stripes should be wide"
-    elif "inverse" in failed:
-        observation = (
-            f"a Gray bit of axis {axis} and its inverse are alike at {100 * (1 - a.opposed):.0f} % of the pixels"
-        )
-    elif "rule" in failed:
-        observation = f"a Gray bit of axis {axis} contradicts the other bits at {100 * (1 - a.rule):.0f} % of its edges"
-    elif failed & {"common", "rising", "cell"}:
-        observation = (
-            f"Gray code and fringes of axis {axis} do not fit together: the code's edges fall at no common phase"
-        )
-    elif failed & {"levels", "level offset"}:
-        observation = f"the fringe periods of axis {axis} contradict each other"
-    else:
-        observation = f"{100 * a.outside:.0f} % of the {axis} codes lie outside the projector"
+    observations = (
+        ({"bits"}, f"Gray bit {a.unreadable} of axis {axis} cannot be read though its stripes should be wide"),
+        (
+            {"inverse"},
+            f"a Gray bit of axis {axis} and its inverse are alike at {100 * (1 - a.opposed):.0f} % of the pixels",
+        ),
+        ({"rule"}, f"a Gray bit of axis {axis} contradicts the other bits at {100 * (1 - a.rule):.0f} % of its edges"),
+        (
+            {"common", "rising", "cell"},
+            f"Gray code and fringes of axis {axis} do not fit together: the code's edges fall at no common phase",
+        ),
+        ({"levels", "level offset"}, f"the fringe periods of axis {axis} contradict each other"),
+        (failed, f"{100 * a.outside:.0f} % of the {axis} codes lie outside the projector"),
+    )
+    observation = next(text for tests, text in observations if failed & tests)
     text = (
         f"{observation}, and no other order, numbering or size of the frames explains it: check that all frames belong "
         "to one capture, that nothing moved, and the periods, steps and bits of the description"

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from slviewer.geometry.jit import kernel
 
+FloatMap = NDArray[np.float32]
 TILES = (4, 5)
 """Rows and columns of tiles in which the blur is estimated: it may vary over the image."""
 REACH = 8
@@ -59,18 +60,16 @@ class EdgeDisplacement:
     surface continues across the edge and its phase confirms the shift, which can be subtracted there.
     """
 
-    shift: NDArray[np.float32]
+    shift: FloatMap
     is_continuous: NDArray[np.bool_]
 
     @property
-    def remaining(self) -> NDArray[np.float32]:
+    def remaining(self) -> FloatMap:
         """(h, w) float32: error of a phase from which the shift was subtracted where the surface is continuous."""
         return np.abs(self.shift) * np.where(self.is_continuous, np.float32(REMAINING), np.float32(1))
 
 
-def estimate_camera_blur(
-    modulation: NDArray[np.float32], mask: NDArray[np.bool_], noise: float = 0.0
-) -> NDArray[np.float32]:
+def estimate_camera_blur(modulation: FloatMap, mask: NDArray[np.bool_], noise: float = 0.0) -> FloatMap:
     """Estimate the standard deviation, px, of the camera's point spread: (rows, columns) of `TILES` float32.
 
     From the steepness of the edges of the modulation (h, w) grey levels; the aperture of an ideal pixel where there are
@@ -108,9 +107,7 @@ def estimate_camera_blur(
     return blur
 
 
-def estimate_displacement(
-    phase: NDArray[np.float32], modulation: NDArray[np.float32], noise: float = 0.0
-) -> EdgeDisplacement:
+def estimate_displacement(phase: FloatMap, modulation: FloatMap, noise: float = 0.0) -> EdgeDisplacement:
     """Estimate the displacement of the ``phase`` (h, w) rad by the camera's blur.
 
     ``modulation`` (h, w) grey levels, of standard deviation ``noise``. Depth jumps and glossy edges add errors of their
@@ -129,13 +126,13 @@ def estimate_displacement(
 
 
 def _confirm(
-    phase: NDArray[np.float32],
-    modulation: NDArray[np.float32],
+    phase: FloatMap,
+    modulation: FloatMap,
     displaced: EdgeDisplacement,
     level: NDArray[np.uint8],
     blur: float,
     noise: float,
-) -> NDArray[np.float32]:
+) -> FloatMap:
     """Return the factor (LEVELS,) by which displacements become those of the phase from a straight line.
 
     The line continues the phase of an edge's bright side, from beyond the reach of the ``blur``, px. 0 where too few
@@ -153,8 +150,7 @@ def _confirm(
     rise_u, rise_v = (modulation[v + k, u + 1 - k] - modulation[v - k, u - 1 + k] for k in (0, 1))
     across = np.abs(rise_u) >= np.abs(rise_v)
     dv, du = (
-        np.where(across, 0, np.sign(rise_v) * far).astype(int),
-        np.where(across, np.sign(rise_u) * far, 0).astype(int),
+        np.where(along, np.sign(rise) * far, 0).astype(int) for along, rise in ((~across, rise_v), (across, rise_u))
     )
     shift = displaced.shift[v, u]
     ratio = (phase[v, u] - 2 * phase[v + dv, u + du] + phase[v + 2 * dv, u + 2 * du]) / shift
@@ -162,18 +158,16 @@ def _confirm(
     if np.count_nonzero(known) < REFINED:
         return np.zeros(LEVELS, np.float32)
     ratio, weight, bins = ratio[known], np.abs(shift[known]), level[v, u][known]
-    factors = np.full(LEVELS, _weighted_median(ratio, weight), np.float32)
+    factors = np.full(LEVELS, _compute_weighted_median(ratio, weight), np.float32)
     for k in np.flatnonzero(np.bincount(bins, minlength=LEVELS) >= REFINED_AT_LEVEL):
-        factors[k] = _weighted_median(ratio[bins == k], weight[bins == k])
+        factors[k] = _compute_weighted_median(ratio[bins == k], weight[bins == k])
     is_confirmed = REFINEMENT[0] <= factors.min() <= factors.max() <= REFINEMENT[1]
     return factors if is_confirmed else np.zeros(LEVELS, np.float32)
 
 
-def _weighted_median(values: NDArray[np.float32], weights: NDArray[np.float32]) -> float:
+def _compute_weighted_median(values: FloatMap, weights: FloatMap) -> float:
     """Return the median of values of these weights, all above 0."""
-    order = np.argsort(values)
-    total = np.cumsum(weights[order], dtype=np.float64)
-    return float(values[order[np.searchsorted(total, total[-1] / 2)]])
+    return float(np.quantile(values, 0.5, weights=weights, method="inverted_cdf"))
 
 
 @kernel()
@@ -236,12 +230,8 @@ def _continues(phase, modulation, noise, v, u, step_v, step_u):
     after, last = phase[v + step_v, u + step_u], phase[v + far_v, u + far_u]
     if not (np.isfinite(first) and np.isfinite(before) and np.isfinite(after) and np.isfinite(last)):
         return False
-    near = _square_noise(modulation, noise, v - step_v, u - step_u) + _square_noise(
-        modulation, noise, v + step_v, u + step_u
-    )
-    ends = _square_noise(modulation, noise, v - far_v, u - far_u) + _square_noise(
-        modulation, noise, v + far_v, u + far_u
-    )
+    near = _add_square_noise(modulation, noise, v, u, step_v, step_u)
+    ends = _add_square_noise(modulation, noise, v, u, far_v, far_u)
     jump = abs(np.float32(2) * (after - before) - last + first)
     turn = abs(before - first - last + after)
     allowed, sigmas = np.float32(BENT), np.float32(BENT_SIGMAS)
@@ -251,9 +241,10 @@ def _continues(phase, modulation, noise, v, u, step_v, step_u):
 
 
 @kernel()
-def _square_noise(modulation, noise, v, u):
-    """Return the variance of a pixel's phase, rad^2."""
-    return (noise / max(modulation[v, u], noise)) ** 2
+def _add_square_noise(modulation, noise, v, u, step_v, step_u):
+    """Return the sum of the variances of the phase, rad^2, a step before and a step after a pixel."""
+    before, after = modulation[v - step_v, u - step_u], modulation[v + step_v, u + step_u]
+    return (noise / max(before, noise)) ** 2 + (noise / max(after, noise)) ** 2
 
 
 @kernel()

@@ -4,13 +4,15 @@ Every image is compared with the darkest and the brightest level of each pixel: 
 phase steps have the same mean level in all pixels.
 """
 
-from dataclasses import dataclass
-from itertools import combinations, pairwise
+from dataclasses import dataclass, field
+from itertools import combinations, groupby, pairwise
 from typing import Literal
 
 import numpy as np
 
-from slviewer.fringe.line_sample import LineSample, sample_frames
+from slviewer.fringe.line_sample import LineSample
+from slviewer.fringe.residual_sample import evaluate_cosine, fit_cosine, measure_concentration
+from slviewer.fringe.sequence import Indices
 
 MOST_STEPS = 36
 MOST_BITS = 16
@@ -46,6 +48,8 @@ DIM = 0.25
 """Share of the brightest pixels' swing below which a pixel may show reflections of other stripes."""
 
 Even = Literal["white", "black"]
+Doubt = tuple[Indices, str]
+"""Images, and why it is doubtful what they show."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +60,7 @@ class PhaseRun:
     ``misfit``: rms residual of the cosine, as a share of the amplitude.
     """
 
-    images: tuple[int, ...]
+    images: Indices
     gradient: tuple[float, float]
     misfit: float
 
@@ -77,20 +81,19 @@ class Bit:
     even: Even | None
 
     @property
-    def images(self) -> tuple[int, ...]:
+    def images(self) -> Indices:
         """Image of the bit, then that of its inverse."""
         return (self.image,) if self.inverse is None else (self.image, self.inverse)
 
 
 @dataclass(frozen=True)
 class GrayBlock:
-    """Bits of a Gray code, widest stripes first. ``is_reversed``: the finest bit was captured first."""
+    """Bits of a Gray code, widest stripes first."""
 
     bits: tuple[Bit, ...]
-    is_reversed: bool
 
     @property
-    def images(self) -> tuple[int, ...]:
+    def images(self) -> Indices:
         """Images of all bits and inverses, in order of capture."""
         return tuple(sorted(image for bit in self.bits for image in bit.images))
 
@@ -101,22 +104,17 @@ class GrayBlock:
         return varying_bits[-1].edges
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class FrameBlocks:
     """All images of a capture in blocks, and the images that fit no block.
 
     ``even``: images of even light, by index; ``doubts``: (images, text) of what does not fit.
     """
 
-    runs: tuple[PhaseRun, ...]
-    codes: tuple[GrayBlock, ...]
-    even: dict[int, Even]
-    doubts: tuple[tuple[tuple[int, ...], str], ...]
-
-
-def sample_undescribed(stack: np.ndarray) -> LineSample:
-    """Return sampled lines of an (n, h, w) stack of which any image may carry a pattern."""
-    return sample_frames(stack, list(range(len(stack))))
+    runs: list[PhaseRun]
+    codes: list[GrayBlock] = field(default_factory=list)
+    even: dict[int, Even] = field(default_factory=dict)
+    doubts: list[Doubt] = field(default_factory=list)
 
 
 class BlockReader:
@@ -145,14 +143,14 @@ class BlockReader:
         """Number of sampled pixels that vary."""
         return self.levels.shape[1]
 
-    def phasor(self, images: tuple[int, ...]) -> np.ndarray:
+    def phasor(self, images: Indices) -> np.ndarray:
         """Fit modulation * e^(i phase), (p,) complex64, to images that are equidistant steps.
 
         The phase rises with the step.
         """
-        return _fit_phasor(self.levels[list(images)])
+        return fit_cosine(self.levels[list(images)])[1]
 
-    def run(self, images: tuple[int, ...]) -> PhaseRun | None:
+    def run(self, images: Indices) -> PhaseRun | None:
         """Return the images as a run of all steps of one period; None if they are not."""
         rows = list(images)
         if float(self._in_middle[rows].mean()) < MIN_MIDDLE or not _is_cosine(self._coarse[rows], COARSE):
@@ -163,10 +161,10 @@ class BlockReader:
             return None
         if not _is_cosine(levels):
             return None
-        phasor = _fit_phasor(levels)
+        phasor = fit_cosine(levels)[1]
         step = np.angle(phasor[1:] * np.conj(phasor[:-1]))
         along, across = (float(np.median(step[self.adjacent & part])) for part in (~self.across[1:], self.across[1:]))
-        return PhaseRun(images, (along, across), _measure_misfit(levels, phasor))
+        return PhaseRun(images, (along, across), _measure_misfit(levels))
 
     def bit(self, image: int, inverse: int | None) -> Bit:
         """Measure the stripes of an image, compared with its inverse where there is one."""
@@ -198,47 +196,28 @@ def _is_cosine(levels: np.ndarray, tolerance: float = 1.0) -> bool:
     """Return whether levels (n, p) are n steps of a cosine of many phases, within ``tolerance`` times the limits."""
     if float(np.std(levels.mean(axis=0))) > MAX_SPREAD * tolerance:
         return False
-    phasor = _fit_phasor(levels)
-    strength = np.abs(phasor)
-    if float(np.median(strength)) < DECIDED / tolerance or _measure_misfit(levels, phasor) > MAX_MISFIT * tolerance:
+    phasor = fit_cosine(levels)[1]
+    is_weak = float(np.median(np.abs(phasor))) < DECIDED / tolerance
+    if is_weak or _measure_misfit(levels) > MAX_MISFIT * tolerance:
         return False
-    return 1 - abs(complex((phasor / np.maximum(strength, 1e-6)).mean())) >= (1 - MAX_COMMON) / tolerance
+    return 1 - measure_concentration(phasor) >= (1 - MAX_COMMON) / tolerance
 
 
-def _fit_phasor(levels: np.ndarray) -> np.ndarray:
-    """Fit modulation * e^(i phase), (p,) complex64, to levels (n, p), for a phase that rises with the step."""
-    n = len(levels)
-    angle = 2 * np.pi * np.arange(n) / n
-    cosine, sine = (np.stack([np.cos(angle), np.sin(angle)]) * (2 / n)).astype(np.float32) @ levels
-    phasor = np.empty(len(cosine), np.complex64)
-    phasor.real, phasor.imag = cosine, -sine
-    return phasor
-
-
-def _measure_misfit(levels: np.ndarray, phasor: np.ndarray) -> float:
+def _measure_misfit(levels: np.ndarray) -> float:
     """Return the rms residual of a cosine fitted to levels (n, p), as a share of its median amplitude."""
-    angle = 2 * np.pi * np.arange(len(levels)) / len(levels)
-    waves = np.stack([np.cos(angle), -np.sin(angle)], axis=1).astype(np.float32)
-    residual = levels - levels.mean(axis=0) - waves @ np.stack([phasor.real, phasor.imag])
+    background, phasor = fit_cosine(levels)
+    residual = levels - evaluate_cosine(background, phasor, len(levels))
     return float(np.sqrt(np.mean(residual**2))) / max(float(np.median(np.abs(phasor))), 1e-6)
 
 
 def group_frames(reader: BlockReader) -> FrameBlocks:
     """Group the images into runs of phase steps, Gray codes and even light."""
-    runs = _detect_phase_runs(reader)
-    grouped_images = {image for run in runs for image in run.images}
-    codes: list[GrayBlock] = []
-    even: dict[int, Even] = {}
-    doubts: list[tuple[tuple[int, ...], str]] = []
-    segment: list[int] = []
-    for image in range(len(reader.levels) + 1):
-        if image < len(reader.levels) and image not in grouped_images:
-            segment.append(image)
-            continue
-        if segment:
-            _split_segment(_pair_inverses(reader, segment), codes, even, doubts)
-        segment = []
-    return FrameBlocks(tuple(runs), tuple(codes), even, tuple(doubts))
+    blocks = FrameBlocks(_detect_phase_runs(reader))
+    steps = {image for run in blocks.runs for image in run.images}
+    for are_steps, images in groupby(range(len(reader.levels)), steps.__contains__):
+        if not are_steps:
+            _split_segment(_pair_inverses(reader, list(images)), blocks)
+    return blocks
 
 
 def _detect_phase_runs(reader: BlockReader) -> list[PhaseRun]:
@@ -283,36 +262,29 @@ def _pair_inverses(reader: BlockReader, images: list[int]) -> list[Bit]:
     return out
 
 
-def _split_segment(
-    bits: list[Bit], codes: list[GrayBlock], even: dict[int, Even], doubts: list[tuple[tuple[int, ...], str]]
-) -> None:
-    """Sort the images between two runs of phase steps into ``codes``, ``even`` and ``doubts``, in place."""
+def _split_segment(bits: list[Bit], blocks: FrameBlocks) -> None:
+    """Sort the images between two runs of phase steps into ``blocks``, in place."""
     striped = [bit for bit in bits if bit.even is None and bit.is_readable]
     rises = sum(b.count > a.count for a, b in pairwise(striped))
     is_reversed = 2 * rises < len(striped) - 1
     with_inverse = 2 * sum(bit.inverse is not None for bit in striped) > len(striped)
     waiting: list[Bit] = []
     block: list[Bit] = []
-
-    def close_block() -> None:
-        """Add the current block of bits to the codes, and begin a new one."""
-        if block:
-            _add_block(block, is_reversed, codes, doubts)
-        block.clear()
-
     for bit in bits[::-1] if is_reversed else bits:
         if bit.even is not None:
             waiting.append(bit)
             continue
         last = max((b.count for b in block if b.is_readable), default=0)
         if bit.is_readable and last > FEWEST_EDGES and bit.count < DROP * last:
-            close_block()
+            _add_block(block, blocks)
+            block = []
         # Stripes grow finer within a code: what is even between two of its bits is a bit as well.
-        block += waiting if block else _select_leading_bits(waiting, even, with_inverse)
+        block += waiting if block else _select_leading_bits(waiting, blocks.even, with_inverse)
         waiting = []
         block.append(bit)
-    close_block()
-    _record_even_images(waiting, even)
+    if block:
+        _add_block(block, blocks)
+    _record_even_images(waiting, blocks.even)
 
 
 def _select_leading_bits(waiting: list[Bit], even: dict[int, Even], with_inverse: bool) -> list[Bit]:
@@ -336,20 +308,16 @@ def _record_even_images(bits: list[Bit], even: dict[int, Even]) -> None:
             even[bit.inverse] = "black" if bit.even == "white" else "white"
 
 
-def _add_block(
-    block: list[Bit], is_reversed: bool, codes: list[GrayBlock], doubts: list[tuple[tuple[int, ...], str]]
-) -> None:
-    """Add successive bits to ``codes`` as a Gray code, or to ``doubts`` the reason why they are none."""
+def _add_block(block: list[Bit], blocks: FrameBlocks) -> None:
+    """Add successive bits to ``blocks`` as a Gray code, or as a doubt with the reason why they are none."""
     images = tuple(sorted(image for bit in block for image in bit.images))
     paired = {bit.inverse is not None for bit in block}
     readable = [bit for bit in block if bit.is_readable and bit.even is None]
     if not readable:
-        doubts.append((images, "they show neither phase steps, nor stripes of a code, nor even light"))
-        return
-    if len(block) > MOST_BITS:
-        doubts.append((images, f"{len(block)} bits of one code: no projector has so many lines"))
-        return
-    if len(paired) > 1:
-        doubts.append((images, "some of these bits are followed by their inverse, and some are not"))
-        return
-    codes.append(GrayBlock(tuple(block), is_reversed))
+        blocks.doubts.append((images, "they show neither phase steps, nor stripes of a code, nor even light"))
+    elif len(block) > MOST_BITS:
+        blocks.doubts.append((images, f"{len(block)} bits of one code: no projector has so many lines"))
+    elif len(paired) > 1:
+        blocks.doubts.append((images, "some of these bits are followed by their inverse, and some are not"))
+    else:
+        blocks.codes.append(GrayBlock(tuple(block)))

@@ -24,8 +24,8 @@ from slviewer.fringe.light_fit import (
     fit_light,
     light_model,
 )
-from slviewer.fringe.light_sample import MIN_PIXELS, LightSample, estimate_albedo, sample_light
-from slviewer.fringe.sequence import Axis, PatternSequence
+from slviewer.fringe.light_sample import MIN_PIXELS, LightSample, estimate_albedo, list_shifts, sample_light
+from slviewer.fringe.sequence import Indices, PatternSequence
 from slviewer.fringe.suspect import Fault, Suspect
 
 LEAST_GAIN = 0.005
@@ -168,35 +168,13 @@ def equalize_frames(
         stack, np.array(chosen), gain[chosen].astype(np.float32), offset[chosen].astype(np.float32),
         along_rows[chosen].astype(np.float32), along_columns[chosen].astype(np.float32), albedo, scale, out,
     )  # fmt: skip
-    for _, steps in (shift for axis in sequence.axes for shift in sequence.phase_shifts(axis)):
+    for steps in list_shifts(sequence):
         if places := [k for k, i in enumerate(chosen) if i in steps]:
             clipped = np.maximum.reduce([stack[chosen[k]] for k in places]) >= white
             for k in places:
                 out[k][clipped] = CLIPPED
     full_scale = None if sequence.full_scale is None else int(CLIPPED)
     return replace(sequence, frames=tuple(sequence.frames[i] for i in chosen), full_scale=full_scale), out, scale
-
-
-def equalize_axis(
-    sequence: PatternSequence, stack: np.ndarray, axis: Axis, light: FrameLight | None = None
-) -> tuple[PatternSequence, np.ndarray, float]:
-    """Return the sequence and the frames of one axis under equal light, and the factor of their grey levels.
-
-    Sequence and stack are returned unchanged, with the factor 1, where the light needs no correction. ``light``:
-    estimated if None.
-    """
-    light = light or estimate_frame_light(sequence, stack)
-    if not light.is_significant:
-        return sequence, stack, 1.0
-    return equalize_frames(sequence, stack, light, sequence.select(axis))
-
-
-def restore_levels(
-    modulation: np.ndarray, background: np.ndarray, noise: tuple[float, float], factor: float
-) -> tuple[np.ndarray, np.ndarray, tuple[float, float]]:
-    """Convert modulation, background and noise (a, b) of equalized frames to the grey levels of the capture."""
-    per_level = np.float32(1 / factor)
-    return modulation * per_level, background * per_level, (noise[0] / factor**2, noise[1] / factor)
 
 
 def describe_disturbance(terms: Sequence[Term]) -> tuple[Fault, str]:
@@ -245,16 +223,14 @@ def detect_light_faults(sequence: PatternSequence, light: FrameLight) -> list[Su
             change = 100 * float(light.room[k] - light.room[k - 1])
             more = "brighter" if change > 0 else "darker"
             steps = _count_steps_across_change(sequence, k)
-            outcome = (
-                f"between {steps} phase steps this cannot be corrected reliably; capture again in constant room light"
-                if steps
-                else "corrected; keep the light of the room constant, or switch it off"
-            )
-            observation = (
-                f"the light of the room changed: from frame {k + 1} on the scene is {abs(change):.0f} % {more}"
-            )
-            text = f"{observation}: {outcome}"
-            out.append(Suspect(k, "room-light", text))
+            outcome = "corrected; keep the light of the room constant, or switch it off"
+            if steps:
+                outcome = (
+                    f"between {steps} phase steps this cannot be corrected reliably; capture again in constant room "
+                    "light"
+                )
+            text = f"the light of the room changed: from frame {k + 1} on the scene is {abs(change):.0f} % {more}"
+            out.append(Suspect(k, "room-light", f"{text}: {outcome}"))
     return out
 
 
@@ -264,7 +240,7 @@ def _count_steps_across_change(sequence: PatternSequence, k: int) -> int:
     0 if there is no such period, or if it has enough steps to separate uniform light from light in proportion to the
     albedo.
     """
-    for _, steps in (shift for axis in sequence.axes for shift in sequence.phase_shifts(axis)):
+    for steps in list_shifts(sequence):
         if len(steps) <= FEW_STEPS and min(steps) < k <= max(steps):
             return len(steps)
     return 0
@@ -298,9 +274,7 @@ def _list_candidate_models(sample: LightSample, gains: Fit) -> Iterator[tuple[tu
             yield terms, replace(start, gain=constant.gain, changes=changes)
 
 
-def _locate_room_changes(
-    sample: LightSample, light: Light, weight: np.ndarray
-) -> tuple[tuple[int, ...], tuple[int, ...]]:  # fmt: skip
+def _locate_room_changes(sample: LightSample, light: Light, weight: np.ndarray) -> tuple[Indices, Indices]:
     """Return the frame before which a change of the room light explains most of the residual; empty if there is none.
 
     First of a change of room light alone, then together with gains. ``weight`` (p,) of the pixels.
@@ -320,9 +294,7 @@ def _locate_room_changes(
     )
 
 
-def _select_room_change(
-    model: LightModel, normal: np.ndarray, moment: np.ndarray, free_columns: list[int]
-) -> tuple[int, ...]:  # fmt: skip
+def _select_room_change(model: LightModel, normal: np.ndarray, moment: np.ndarray, free_columns: list[int]) -> Indices:
     """Return the frame before which a change of the room light explains most of the residual; empty if there is none.
 
     ``normal`` and ``moment`` of gains, uniform light and albedo. The unknowns ``free_columns``, which every change has

@@ -4,12 +4,12 @@ Images may be late, missing, repeated or exchanged.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 
-from slviewer.fringe.agreement_tests import SURE, Answer, failed_tests, is_supported, sum_shares
+from slviewer.fringe.agreement_tests import SURE, Answer, failed_tests, has_evidence, is_proven, sum_shares
 from slviewer.fringe.axis_agreement import measure_agreement, measure_code_agreement
-from slviewer.fringe.axis_reader import AxisFrames, AxisReader, described_frames
+from slviewer.fringe.axis_reader import AxisFrames, AxisReader, Images, described_frames
 from slviewer.fringe.contradiction import Contradiction
 from slviewer.fringe.frame_likeness import FrameLikeness
 from slviewer.fringe.ghost import detect_ghosting
@@ -17,7 +17,7 @@ from slviewer.fringe.layout import Shift
 from slviewer.fringe.line_sample import LineSample
 from slviewer.fringe.residual_order import detect_misordered_steps, detect_strange_frames, recover_step_order
 from slviewer.fringe.residual_sample import BESIDE, sample_fringe
-from slviewer.fringe.sequence import Axis, PatternSequence
+from slviewer.fringe.sequence import Axis, Indices, PatternSequence
 from slviewer.fringe.suspect import Suspect
 
 NAMED_BY_STEPS = 0.5
@@ -25,8 +25,6 @@ NAMED_BY_STEPS = 0.5
 
 COARSE_MARGIN = 0.15
 """Tolerance of the length of a mean unit vector between a sample and a small part of it."""
-
-Images = tuple[int | None, ...]
 
 
 @dataclass(frozen=True)
@@ -79,7 +77,7 @@ class StepReader:
     def _judge_axis(self, axis: Axis, images: Images | None) -> Iterator[_StepFindings]:
         """Yield the findings of each period whose steps are all present and whose fringes are in view."""
         count = len(self._sample.lines)
-        images = tuple(range(count)) if images is None else images
+        images = images or tuple(range(count))
         for period, steps in self._sequence.phase_shifts(axis):
             if None in (images[i] for i in steps):
                 continue
@@ -89,7 +87,7 @@ class StepReader:
             if findings is not None:
                 yield findings
 
-    def _judge_period(self, shift: Shift, first: int, seen: tuple[int, ...]) -> _StepFindings | None:
+    def _judge_period(self, shift: Shift, first: int, seen: Indices) -> _StepFindings | None:
         """Return the findings of one period, image ``seen[i]`` shown as frame ``first + i``; None without fringes."""
         lines, white = self._sample.lines, self._sample.white
         images = [*range(first), *seen, *range(first + len(seen), len(lines))]
@@ -99,14 +97,14 @@ class StepReader:
         if order := recover_step_order(sampled):
             return _StepFindings(order, [], [])
         misplaced = detect_misordered_steps(sampled)
-        if misplaced or sampled.steps <= 3 or detect_ghosting(sampled):  # all steps hold a share of the image before
-            return _StepFindings(None, misplaced, [])
-        return _StepFindings(None, [], detect_strange_frames(sampled))
+        # With ghosting all steps hold a share of the image before.
+        is_judged = not misplaced and sampled.steps > 3 and not detect_ghosting(sampled)
+        return _StepFindings(None, misplaced, detect_strange_frames(sampled) if is_judged else [])
 
 
 def detect_copies(
     sequence: PatternSequence, readers: dict[Axis, AxisReader], likeness: FrameLikeness
-) -> tuple[Contradiction, ...]:  # fmt: skip
+) -> tuple[Contradiction, ...]:
     """Return the contradictions of images that repeat another one; empty unless all tests pass without them."""
     pairs = likeness.repeated()
     if not pairs:
@@ -139,29 +137,25 @@ def search_order(
     ``disordered``: contradictions of the phase steps alone; an order that agrees with them is preferred.
     """
     named_by_steps = {(contradiction.cause, contradiction.value) for contradiction in disordered}
-    passed: list[Answer] = []
-    orders: list[Images] = []
+    passed: list[tuple[float, Images, Contradiction]] = []
     for images, contradiction, penalty in _list_orders(sequence):
         score = _score_order(sequence, readers, likeness, images)
         if score is not None:
             score += NAMED_BY_STEPS * ((contradiction.cause, contradiction.value) in named_by_steps) - penalty
-            orders.append(images)
-            passed.append(Answer((contradiction,), score))
-    for i in sorted(range(len(passed)), key=lambda i: -round(passed[i].score / 0.02)):
-        images = orders[i]
+            passed.append((score, images, contradiction))
+    for score, images, contradiction in sorted(passed, key=lambda order: -round(order[0] / 0.02)):
         ordered = not any(steps.detect_misplaced_steps(axis, images) for axis in sequence.axes)
         if ordered and not steps.detect_unexplained_steps(images):
-            (contradiction_found,) = passed[i].contradictions
-            k = int(contradiction_found.value or 0)
-            if contradiction_found.cause == "duplicate-frame" and (j := likeness.copied(k)) is not None:
-                return replace(passed[i], contradictions=(_describe_duplicate(sequence, k, j),))
-            return passed[i]
+            k = int(contradiction.value or 0)
+            if contradiction.cause == "duplicate-frame" and (j := likeness.copied(k)) is not None:
+                contradiction = _describe_duplicate(sequence, k, j)
+            return Answer((contradiction,), score)
     return None
 
 
 def _score_order(
     sequence: PatternSequence, readers: dict[Axis, AxisReader], likeness: FrameLikeness, images: Images
-) -> float | None:  # fmt: skip
+) -> float | None:
     """Return the sum of the agreement shares of all axes in this order of the images.
 
     None if a test fails, or if no axis gives positive evidence for the order.
@@ -169,19 +163,17 @@ def _score_order(
     if not all(map(likeness.is_even, range(len(images)), images)):
         return None
     described = {axis: described_frames(sequence, axis, images) for axis in sequence.axes}
-    if any(
-        _is_refuted(readers[axis], frames) and readers[axis].is_in_view(frames) for axis, frames in described.items()
-    ):
+    if any(_is_refuted(readers[axis], own) and readers[axis].is_in_view(own) for axis, own in described.items()):
         return None
     score, is_any_supported = 0.0, False
     for axis, frames in described.items():
         a = measure_agreement(readers[axis], frames)
-        if failed_tests(frames, a) or not (is_supported(frames, a) or _lacks_steps(frames)):
-            if readers[axis].is_in_view(frames):
-                return None
-            continue
-        is_any_supported |= is_supported(frames, a)
-        score += sum_shares(a)
+        is_supported = has_evidence(frames, a)
+        if not failed_tests(frames, a) and (is_supported or _lacks_steps(frames)):
+            is_any_supported |= is_supported
+            score += sum_shares(a)
+        elif readers[axis].is_in_view(frames):
+            return None
     return score if is_any_supported else None
 
 
@@ -191,8 +183,7 @@ def _is_refuted(reader: AxisReader, frames: AxisFrames) -> bool:
     This takes a fraction of the time that all tests take, and excludes most orders.
     """
     if frames.bits:
-        a = measure_code_agreement(reader, frames)
-        return bool(failed_tests(frames, a)) or not is_supported(frames, a)
+        return not is_proven(frames, measure_code_agreement(reader, frames))
     return min(measure_agreement(reader.coarse, frames).level_common, default=1.0) < SURE - COARSE_MARGIN
 
 
@@ -203,7 +194,7 @@ def _list_orders(sequence: PatternSequence) -> Iterator[tuple[Images, Contradict
     """
     n = len(sequence.frames)
     for lag in (1, 2, -1):
-        images = tuple(i + lag if 0 <= i + lag < n else None for i in range(n))
+        images: Images = tuple(i + lag if 0 <= i + lag < n else None for i in range(n))
         count = "one image" if abs(lag) == 1 else f"{abs(lag)} images"
         way = (
             "late, so that each shows the pattern before its own: let the camera wait longer after each pattern, or "
@@ -215,26 +206,26 @@ def _list_orders(sequence: PatternSequence) -> Iterator[tuple[Images, Contradict
         text = f"all frames are {count} {way}; capture again, or move the files by {count}"
         # Without its first bit an inverted code is a code as well: the fewer images are lost, the better.
         yield images, Contradiction("frame-lag", text, None, float(lag)), 0.04 * (abs(lag) - 1)
+    every = tuple(range(n))
+    lagging = (
+        "from frame {0} on the camera is one image behind the projector, and image {0} repeats the one before: capture "
+        "again"
+    )
+    missing = "frame {0} is missing, and those that follow come one place too early: add the image, or capture again"
+    foreign = "frame {0} does not show the pattern described for it: look at this image, and capture again"
+    swapped = "frames {0} and {1} have changed places: exchange these two files, or capture again"
+
+    def describe(cause: str, text: str, k: int) -> Contradiction:
+        """Return the contradiction of a fault from frame ``k`` on."""
+        return Contradiction(cause, text.format(k + 1, k + 2), sequence.frames[k].axis, float(k))
+
     for k in range(n - 1):
-        images = (*range(k), k + 1, k, *range(k + 2, n))
-        text = f"frames {k + 1} and {k + 2} have changed places: exchange these two files, or capture again"
-        yield images, Contradiction("frame-order", text, sequence.frames[k].axis, float(k)), 0.0
+        yield (*every[:k], k + 1, k, *every[k + 2 :]), describe("frame-order", swapped, k), 0.0
     for k in range(1, n):
-        images = (*range(k), *(i + 1 if i + 1 < n else None for i in range(k, n)))
-        text = (
-            f"from frame {k + 1} on the camera is one image behind the projector, and image {k + 1} repeats the one "
-            "before: capture again"
-        )
-        yield images, Contradiction("frame-lag", text, sequence.frames[k].axis, float(k)), 0.05
-        images = (*range(k), None, *range(k, n - 1))
-        text = (
-            f"frame {k + 1} is missing, and those that follow come one place too early: add the image, or capture again"
-        )
-        yield images, Contradiction("missing-frame", text, sequence.frames[k].axis, float(k)), 0.1
+        yield (*every[:k], *every[k + 1 :], None), describe("frame-lag", lagging, k), 0.05
+        yield (*every[:k], None, *every[k:-1]), describe("missing-frame", missing, k), 0.1
     for k in range(n):
-        images = (*range(k), None, *range(k + 1, n))
-        text = f"frame {k + 1} does not show the pattern described for it: look at this image, and capture again"
-        yield images, Contradiction("duplicate-frame", text, sequence.frames[k].axis, float(k)), 0.2
+        yield (*every[:k], None, *every[k + 1 :]), describe("duplicate-frame", foreign, k), 0.2
 
 
 def _lacks_steps(frames: AxisFrames) -> bool:

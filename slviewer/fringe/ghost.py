@@ -53,19 +53,11 @@ def detect_ghosting(sampled: Fringe) -> list[Suspect]:
     if not (LEAST_SHARE < share < MOST_SHARE and share > SIGMAS * error):
         return []
     i = sampled.shift.indices[0]
+    text = f"frame {i + 1} holds {100 * share:.0f} % of the image before it (ghosting), and so may every frame"
     if i == 0:
-        observation = (
-            f"the frames hold {100 * share:.0f} % of the image before them (ghosting), but for frame 1, the first"
-        )
-    else:
-        observation = (
-            f"frame {i + 1} holds {100 * share:.0f} % of the image before it (ghosting), and so may every frame"
-        )
-    return [
-        Suspect(
-            i,
-            "strange",
-            f"{observation}: the projector "
-            "changes its image slowly, or the camera exposes during the change; wait longer after each pattern",
-        )
-    ]
+        text = f"the frames hold {100 * share:.0f} % of the image before them (ghosting), but for frame 1, the first"
+    text += (
+        ": the projector changes its image slowly, or the camera exposes during the change; wait longer after each "
+        "pattern"
+    )
+    return [Suspect(i, "strange", text)]

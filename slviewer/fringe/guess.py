@@ -1,19 +1,20 @@
 """Guess of the description of a capture from its images alone, with the evidence and the open questions."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
 
 from slviewer.errors import InputError
-from slviewer.fringe.agreement_tests import SURE, failed_tests, is_supported, wrap
-from slviewer.fringe.axis_agreement import Agreement, measure_agreement
+from slviewer.fringe.agreement_tests import MAX_CELL, SURE, is_proven, wrap
+from slviewer.fringe.axis_agreement import Agreement, fit_turns, measure_agreement
 from slviewer.fringe.axis_reader import AxisFrames, AxisReader, described_frames
+from slviewer.fringe.description_change import LINES, step_turns
 from slviewer.fringe.description_check import LEAST_ILLUMINATED, check_description
-from slviewer.fringe.frame_blocks import BlockReader, FrameBlocks, GrayBlock, PhaseRun, group_frames, sample_undescribed
-from slviewer.fringe.line_sample import LineSample, coded_frames
-from slviewer.fringe.sequence import Axis, Frame, PatternSequence, PerAxis
+from slviewer.fringe.frame_blocks import Bit, BlockReader, Doubt, FrameBlocks, GrayBlock, PhaseRun, group_frames
+from slviewer.fringe.line_sample import LineSample, coded_frames, sample_frames
+from slviewer.fringe.sequence import Axis, Frame, Indices, PatternSequence, PerAxis, Size, select_axis_value
 
 ASSUMED_PX = 16.0
 """px of the finest period where nothing states it: a scale, and no measurement."""
@@ -40,8 +41,21 @@ class Guess:
     sequence: PatternSequence | None
     frames: tuple[Frame | None, ...]
     evidence: tuple[tuple[int, str], ...]
-    doubts: tuple[tuple[tuple[int, ...], str], ...]
+    doubts: tuple[Doubt, ...]
     notes: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class _Findings:
+    """Evidence, doubts and notes of a `Guess`, as they are collected."""
+
+    doubts: list[Doubt]
+    evidence: list[tuple[int, str]] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+    def guess(self, sequence: PatternSequence | None, frames: Sequence[Frame | None]) -> Guess:
+        """Return the guess with these findings."""
+        return Guess(sequence, tuple(frames), tuple(self.evidence), tuple(self.doubts), tuple(self.notes))
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +66,7 @@ class _AxisBlocks:
     code: GrayBlock | None
 
 
-def guess_sequence(stack: np.ndarray, projector: tuple[int, int] | None = None) -> Guess:
+def guess_sequence(stack: np.ndarray, projector: Size | None = None) -> Guess:
     """Guess the frames that the images of an (n, h, w) uint8 or uint16 stack show, in the order of the capture.
 
     ``projector``: (width, height) px where it is known. Periods in projector px follow from the images only where Gray
@@ -61,22 +75,40 @@ def guess_sequence(stack: np.ndarray, projector: tuple[int, int] | None = None) 
     """
     if stack.ndim != 3 or len(stack) < 3:
         raise InputError(f"a stack of shape {stack.shape} is no capture: give three or more images of one size")
-    sample = sample_undescribed(stack)
+    sample = sample_frames(stack, list(range(len(stack))))
     reader = BlockReader(sample)
-    nothing: tuple[Frame | None, ...] = (None,) * len(stack)
+    everything = tuple(range(len(stack)))
+    frames: list[Frame | None] = [None] * len(stack)
     share = float(reader.illuminated.mean())
     if share < LEAST_ILLUMINATED or reader.count < 500:
         text = f"{100 * share:.1f} % of the pixels vary from image to image by more than the noise: too dark to be read"
-        return Guess(None, nothing, (), ((tuple(range(len(stack))), text),), ())
+        return _Findings([(everything, text)]).guess(None, frames)
     blocks = group_frames(reader)
-    doubts = list(blocks.doubts)
-    axes = _assign_axes(blocks, doubts)
-    if not axes and not doubts:
-        doubts.append((tuple(range(len(stack))), "no image shows phase steps or stripes of a code"))
-    return _propose_sequence(stack, sample, reader, blocks, axes, doubts, projector)
+    findings = _Findings(list(blocks.doubts))
+    axes = _assign_axes(blocks, findings.doubts)
+    if not axes and not findings.doubts:
+        findings.doubts.append((everything, "no image shows phase steps or stripes of a code"))
+    _identify_frames(reader, blocks, axes, frames, findings)
+    if findings.doubts:
+        return findings.guess(None, frames)
+    try:
+        sequence = PatternSequence(None, tuple(frame for frame in frames if frame is not None))
+    except InputError as error:
+        findings.doubts.append((everything, str(error)))
+        return findings.guess(None, frames)
+    for axis in sequence.axes:
+        sequence = _apply_conventions(sequence, axis, axes[axis], sample, reader, findings)
+    if not findings.doubts:
+        findings.doubts.extend((everything, found.message) for found in check_description(sequence, stack))
+    if not findings.doubts:
+        for axis in sequence.axes:
+            sequence = _scale_to_projector(sequence, axis, sample, projector, findings)
+        sequence = replace(sequence, projector_size=projector)
+    findings.evidence.sort()
+    return findings.guess(sequence, sequence.frames)
 
 
-def _assign_axes(blocks: FrameBlocks, doubts: list[tuple[tuple[int, ...], str]]) -> dict[Axis, _AxisBlocks]:
+def _assign_axes(blocks: FrameBlocks, doubts: list[Doubt]) -> dict[Axis, _AxisBlocks]:
     """Assign the blocks to axes by the direction of their stripes: x for stripes that are rather upright in the camera.
 
     Adds to ``doubts`` stripes that are nearly diagonal, equal periods, and several codes of one axis.
@@ -113,48 +145,24 @@ def _compute_fringe_frequency(run: PhaseRun) -> float:
     return float(np.hypot(*run.gradient))
 
 
-def _propose_sequence(
-    stack: np.ndarray,
-    sample: LineSample,
+def _identify_frames(
     reader: BlockReader,
     blocks: FrameBlocks,
     axes: dict[Axis, _AxisBlocks],
-    doubts: list[tuple[tuple[int, ...], str]],
-    projector: tuple[int, int] | None,
-) -> Guess:
-    """Return the guess for blocks that are assigned to axes, with its evidence, doubts and notes.
-
-    ``sequence`` is None if some image is not identified. ``projector``: (width, height) px, None where it is not known.
-    """
-    frames: list[Frame | None] = [None] * len(stack)
-    evidence: list[tuple[int, str]] = []
-    notes: list[str] = []
+    frames: list[Frame | None],
+    findings: _Findings,
+) -> None:
+    """Set in ``frames`` what each image shows, with the evidence, and a doubt about images that are not identified."""
     kinds = set(blocks.even.values())
     for image, kind in blocks.even.items():
-        frames[image] = Frame(kind if kinds == {"white", "black"} else "texture" if kind == "white" else "black")
-        evidence.append((image, f"evenly {'bright' if kind == 'white' else 'dark'}"))
+        frames[image] = Frame("texture" if kinds == {"white"} else kind)
+        findings.evidence.append((image, f"evenly {'bright' if kind == 'white' else 'dark'}"))
     for axis, parts in axes.items():
         ratios = [_measure_period_ratio(reader, parts.runs[-1], run) for run in parts.runs]
-        _add_frames(axis, parts, ratios, frames, evidence)
+        _add_frames(axis, parts, ratios, frames, findings.evidence)
     open_images = tuple(i for i, frame in enumerate(frames) if frame is None)
-    if open_images and not any(set(open_images) & set(images) for images, _ in doubts):
-        doubts.append((open_images, "what they show cannot be told"))
-    if doubts:
-        return Guess(None, tuple(frames), tuple(evidence), tuple(doubts), ())
-    try:
-        sequence = PatternSequence(None, tuple(frame for frame in frames if frame is not None))
-    except InputError as error:
-        return Guess(None, tuple(frames), tuple(evidence), ((tuple(range(len(frames))), str(error)),), ())
-    for axis in sequence.axes:
-        sequence = _apply_conventions(sequence, axis, axes[axis], sample, reader, evidence, doubts, notes)
-    if not doubts:
-        everything = tuple(range(len(frames)))
-        doubts += [(everything, contradiction.message) for contradiction in check_description(sequence, stack)]
-    if not doubts:
-        for axis in sequence.axes:
-            sequence = _scale_to_projector(sequence, axis, sample, projector, doubts, notes)
-        sequence = replace(sequence, projector_size=projector)
-    return Guess(sequence, sequence.frames, tuple(sorted(evidence)), tuple(doubts), tuple(notes))
+    if open_images and not any(set(open_images) & set(images) for images, _ in findings.doubts):
+        findings.doubts.append((open_images, "what they show cannot be told"))
 
 
 def _measure_period_ratio(reader: BlockReader, finest: PhaseRun, run: PhaseRun) -> float:
@@ -169,10 +177,8 @@ def _measure_period_ratio(reader: BlockReader, finest: PhaseRun, run: PhaseRun) 
     weight = np.abs(steps[0])
     # Weighed by the phase passed, and the median against jumps at the borders of things.
     slope = steps[1] / np.where(weight > 1e-6, steps[0], np.inf)
-    order = np.argsort(slope)
-    total = np.cumsum(weight[order])
-    rough = 1 / max(float(slope[order][np.searchsorted(total, total[-1] / 2)]), 1e-6)
-    return _refine_period_ratio(fine, coarse, rough)
+    middle = float(np.quantile(slope, 0.5, weights=weight, method="inverted_cdf"))
+    return _refine_period_ratio(fine, coarse, 1 / max(middle, 1e-6))
 
 
 def _refine_period_ratio(fine: np.ndarray, coarse: np.ndarray, rough: float) -> float:
@@ -187,14 +193,7 @@ def _refine_period_ratio(fine: np.ndarray, coarse: np.ndarray, rough: float) -> 
     angle = (np.angle(coarse) - cut) % TURN
     span = float(np.quantile(angle, 0.99) - np.quantile(angle, 0.01)) / TURN
     reach = min(0.04, 0.4 / (rough * max(span, 0.05)) + 0.01)
-    ratios = rough * np.linspace(1 - reach, 1 + reach, 401)
-    # From one ratio to the next each unit vector rotates by the same angle.
-    unit, step = np.exp(1j * (np.angle(fine) - ratios[0] * angle)), np.exp(1j * (ratios[0] - ratios[1]) * angle)
-    lengths = []
-    for _ in ratios:
-        lengths.append(abs(complex(unit.sum())))
-        unit *= step
-    return float(ratios[int(np.argmax(lengths))])
+    return fit_turns(np.angle(fine), angle, rough * np.linspace(1 - reach, 1 + reach, 401))
 
 
 def _detect_empty_phase(phasor: np.ndarray) -> float | None:
@@ -232,7 +231,7 @@ def _add_frames(
         frames[bit.image] = Frame("gray", axis, bit=number, bits=bits)
         if bit.inverse is not None:
             frames[bit.inverse] = Frame("inverse", axis, bit=number, bits=bits)
-        share = f"{bit.edges[0 if axis == 'x' else 1]:.3g} edges per camera px"
+        share = f"{bit.edges['xy'.index(axis)]:.3g} edges per camera px"
         observation = f"even in all of the view: bit {number} by its place" if bit.even else f"stripes, {share}"
         if not bit.is_readable:
             observation = f"too fine to be read: bit {number} by its place alone"
@@ -245,78 +244,93 @@ def _apply_conventions(
     parts: _AxisBlocks,
     sample: LineSample,
     blocks_reader: BlockReader,
-    evidence: list[tuple[int, str]],
-    doubts: list[tuple[tuple[int, ...], str]],
-    notes: list[str],
+    findings: _Findings,
 ) -> PatternSequence:
     """Return the sequence with the conventions of one axis that follow from its code and fringes.
 
-    These are the complementary bit, the width of the Gray cells, and sign and offset of the phase. Adds to
-    ``evidence``, ``doubts`` and ``notes``.
+    These are the complementary bit, the width of the Gray cells, and sign and offset of the phase.
     """
-    images = tuple(sorted(coded_frames(sequence, axis)))
-    reader = AxisReader(sample, list(images))
     if parts.code is None:
-        gradient = parts.runs[-1].gradient[0 if axis == "x" else 1]
-        if gradient < 0:
-            doubts.append((images, _describe_reversal(axis, "the phase falls", "or phase_sign is -1")))
-        if len(parts.runs) == 1:
-            notes.append(f"axis {axis}: one period without Gray code gives a phase that is not absolute")
-            return replace(sequence, relative=True)
-        if _detect_empty_phase(blocks_reader.phasor(parts.runs[0].images)) is None:
-            doubts.append(
-                (parts.runs[0].images, f"axis {axis}: its longest period repeats in the view: state period_px")
-            )
-        return sequence
-    frames = described_frames(sequence, axis)
+        return _check_fringes(sequence, axis, parts.runs, blocks_reader, findings)
+    images = tuple(coded_frames(sequence, axis))
+    reader = AxisReader(sample, list(images))
     if not parts.runs:
-        a = measure_agreement(reader, frames)
-        _check_code(frames, a, images, axis, doubts)
-        notes.append(f"axis {axis}: Gray code alone, taken to number the projector's {_name_lines(axis)} one by one")
+        findings.notes.append(f"axis {axis}: Gray code alone, taken to number the projector's {LINES[axis]} one by one")
+    elif not np.isfinite(_measure(sequence, axis, reader)[1].turns_per_cell):
+        text = f"too few edges of the code of axis {axis} are in view to compare it with the fringes"
+        findings.doubts.append((images, text))
         return sequence
-    a = measure_agreement(reader, frames)
-    turns = a.turns_per_cell
-    if not np.isfinite(turns):
-        doubts.append((images, f"too few edges of the code of axis {axis} are in view to compare it with the fringes"))
-        return sequence
-    # ``turns`` of the finest-like period that described_frames compares, per cell of all bits
-    assert frames.fringe is not None
-    if abs(2 * turns - 1) < 0.12 / 2 + WHOLE:
-        last = parts.code.bits[-1].image
-        if parts.code.bits[-1].inverse is None:
-            sequence = _mark_complementary(sequence, axis, last)
-            evidence.append((last, f"its edges lie half way: {turns:.2f} fringes per cell of all bits"))
     else:
-        cell = frames.fringe[0] * (round(turns) if turns > 0.9 and abs(turns - round(turns)) < 0.12 else turns)
-        if abs(cell - sequence.gray_cell(axis)) > 0.01 * cell:
-            sequence = replace(sequence, gray_cell_px=_replace_axis(sequence.gray_cell_px, axis, float(f"{cell:.4g}")))
-        evidence.append((parts.code.bits[-1].image, f"{turns:.3g} fringes per Gray cell"))
+        sequence = _fit_gray_cells(sequence, axis, parts.code.bits[-1], reader, findings)
+        sequence = _fit_phase(sequence, axis, parts.runs[-1], reader, findings)
+    _check_code(images, axis, *_measure(sequence, axis, reader), findings)
+    if parts.runs and parts.runs[-1].gradient["xy".index(axis)] * sequence.sign(axis) < 0:
+        text = _describe_reversal(axis, "the code falls", "or a most significant bit is missing")
+        findings.doubts.append((images, text))
+    return sequence
+
+
+def _measure(sequence: PatternSequence, axis: Axis, reader: AxisReader) -> tuple[AxisFrames, Agreement]:
+    """Return the frames of an axis as the sequence describes them, and their agreement."""
     frames = described_frames(sequence, axis)
-    a = measure_agreement(reader, frames)
-    if a.rising < 0.5:
+    return frames, measure_agreement(reader, frames)
+
+
+def _check_fringes(
+    sequence: PatternSequence, axis: Axis, runs: list[PhaseRun], reader: BlockReader, findings: _Findings
+) -> PatternSequence:
+    """Return the sequence of fringes without a code, marked as relative where they have one period."""
+    if runs[-1].gradient["xy".index(axis)] < 0:
+        text = _describe_reversal(axis, "the phase falls", "or phase_sign is -1")
+        findings.doubts.append((tuple(coded_frames(sequence, axis)), text))
+    if len(runs) == 1:
+        findings.notes.append(f"axis {axis}: one period without Gray code gives a phase that is not absolute")
+        return replace(sequence, relative=True)
+    if _detect_empty_phase(reader.phasor(runs[0].images)) is None:
+        text = f"axis {axis}: its longest period repeats in the view: state period_px"
+        findings.doubts.append((runs[0].images, text))
+    return sequence
+
+
+def _fit_gray_cells(
+    sequence: PatternSequence, axis: Axis, last: Bit, reader: AxisReader, findings: _Findings
+) -> PatternSequence:
+    """Return the sequence with the ``last`` bit as the complementary one, or with the measured width of the cells."""
+    frames, a = _measure(sequence, axis, reader)
+    # ``turns`` of the finest-like period that described_frames compares, per cell of all bits
+    turns = a.turns_per_cell
+    assert frames.fringe is not None
+    if abs(2 * turns - 1) < MAX_CELL / 2 + WHOLE:
+        if last.inverse is None:
+            sequence = _mark_complementary(sequence, axis, last.image)
+            text = f"its edges lie half way: {turns:.2f} fringes per cell of all bits"
+            findings.evidence.append((last.image, text))
+        return sequence
+    cell = frames.fringe[0] * (round(turns) if turns > 0.9 and abs(turns - round(turns)) < MAX_CELL else turns)
+    if abs(cell - sequence.gray_cell(axis)) > 0.01 * cell:
+        sequence = replace(sequence, gray_cell_px=_replace_axis(sequence.gray_cell_px, axis, float(f"{cell:.4g}")))
+    findings.evidence.append((last.image, f"{turns:.3g} fringes per Gray cell"))
+    return sequence
+
+
+def _fit_phase(
+    sequence: PatternSequence, axis: Axis, finest: PhaseRun, reader: AxisReader, findings: _Findings
+) -> PatternSequence:
+    """Return the sequence with the sign and the offset of the phase that follow from the Gray code."""
+    if _measure(sequence, axis, reader)[1].rising < 0.5:
         sequence = replace(sequence, phase_sign=_replace_axis(sequence.phase_sign, axis, -1))
-        evidence.append((parts.runs[-1].images[0], "the phase falls where the code rises"))
-        frames = described_frames(sequence, axis)
-        a = measure_agreement(reader, frames)
+        findings.evidence.append((finest.images[0], "the phase falls where the code rises"))
+    frames, a = _measure(sequence, axis, reader)
     late = wrap(a.begin_turns)
     if abs(late) > 0.1 and frames.fringe is not None:
-        steps = len(frames.fringe[1])
-        snapped = min(
-            (0.25, -0.25, 0.5, *(wrap(k / steps) for k in range(1, steps))), key=lambda t: abs(wrap(late - t))
-        )
-        turn = snapped if abs(wrap(late - snapped)) < 0.06 else late
-        offset = float(f"{TURN * turn:.4g}")
+        snapped = min(step_turns(len(frames.fringe[1])), key=lambda turns: abs(wrap(late - turns)))
+        turns = snapped if abs(wrap(late - snapped)) < 0.06 else late
+        offset = float(f"{TURN * turns:.4g}")
         sequence = replace(sequence, phase_offset_rad=_replace_axis(sequence.phase_offset_rad, axis, offset))
-        notes.append(
+        findings.notes.append(
             f"axis {axis}: the phase is {offset:g} rad where the Gray code begins; written as phase_offset, it may "
             "as well be gray_origin"
         )
-        frames = described_frames(sequence, axis)
-        a = measure_agreement(reader, frames)
-    _check_code(frames, a, images, axis, doubts)
-    gradient = parts.runs[-1].gradient[0 if axis == "x" else 1] * sequence.sign(axis)
-    if gradient < 0:
-        doubts.append((images, _describe_reversal(axis, "the code falls", "or a most significant bit is missing")))
     return sequence
 
 
@@ -324,63 +338,54 @@ def _scale_to_projector(
     sequence: PatternSequence,
     axis: Axis,
     sample: LineSample,
-    projector: tuple[int, int] | None,
-    doubts: list[tuple[tuple[int, ...], str]],
-    notes: list[str],
+    projector: Size | None,
+    findings: _Findings,
 ) -> PatternSequence:
     """Return the sequence with the periods of one axis scaled to projector px.
 
-    The codes in view must be inside the projector, and all codes, or the longest period, must cover it. Adds to
-    ``doubts`` and ``notes``.
+    The codes in view must be inside the projector, and all codes, or the longest period, must cover it.
     """
     periods, bits = sequence.periods_px(axis), len(sequence.find("gray", axis))
     images = tuple(sequence.find("phase", axis) or sequence.find("gray", axis))
     if projector is None:
         if periods:
-            notes.append(
+            findings.notes.append(
                 f"axis {axis}: the width of its fringes in projector px is unknown, only ratios are measured; the "
                 f"finest is written as {periods[-1]:g} px: correct period_px, and add the projector's size"
             )
         return sequence
-    extent = projector[0] if axis == "x" else projector[1]
-    frames = described_frames(sequence, axis)
-    reach = measure_agreement(AxisReader(sample, coded_frames(sequence, axis)), frames).reach_px
+    extent = projector["xy".index(axis)]
+    reach = _measure(sequence, axis, AxisReader(sample, coded_frames(sequence, axis)))[1].reach_px
     covered = sequence.gray_cell(axis) * 2**bits if bits else periods[0]
     if not periods:
         if covered < extent or reach > extent + 1:
-            text = f"{bits} bits number {covered:g} {_name_lines(axis)}, of which {reach:.0f} are in view, not {extent}"
-            doubts.append((images, f"{text}: correct projector, or add gray_cell_px"))
+            text = f"{bits} bits number {covered:g} {LINES[axis]}, of which {reach:.0f} are in view, not {extent}"
+            findings.doubts.append((images, f"{text}: correct projector, or add gray_cell_px"))
         return sequence
     low, high = extent / covered * periods[-1], extent / max(reach, 1.0) * periods[-1]
-    finest = low if high < 1.01 * low else max(float(np.clip(periods[-1], low, high)), FINEST_PX)
+    finest = low
     if high >= 1.01 * low:
-        doubts.append(
-            (images, f"the finest period lies between {low:.2f} and {high:.2f} px, as far as the view shows: state it")
-        )
+        finest = max(float(np.clip(periods[-1], low, high)), FINEST_PX)
+        text = f"the finest period lies between {low:.2f} and {high:.2f} px, as far as the view shows: state it"
+        findings.doubts.append((images, text))
     scale = finest / periods[-1]
     scaled = tuple(
         replace(f, period_px=float(f"{f.period_px * scale:.5g}")) if f.kind == "phase" and f.axis == axis else f
         for f in sequence.frames
     )
-    cell = getattr(sequence.gray_cell_px, axis) if isinstance(sequence.gray_cell_px, PerAxis) else sequence.gray_cell_px
-    cells = (
-        sequence.gray_cell_px
-        if cell is None
-        else _replace_axis(sequence.gray_cell_px, axis, float(f"{cell * scale:.4g}"))
-    )
+    cells = sequence.gray_cell_px
+    if (cell := select_axis_value(cells, axis)) is not None:
+        cells = _replace_axis(cells, axis, float(f"{cell * scale:.4g}"))
     return replace(sequence, frames=scaled, gray_cell_px=cells)
 
 
-def _check_code(
-    frames: AxisFrames, a: Agreement, images: tuple[int, ...], axis: Axis, doubts: list[tuple[tuple[int, ...], str]]
-) -> None:
+def _check_code(images: Indices, axis: Axis, frames: AxisFrames, a: Agreement, findings: _Findings) -> None:
     """Add a doubt where the Gray code and the fringes of an axis do not agree."""
-    failed = failed_tests(frames, a)
-    if failed or not is_supported(frames, a):
+    if not is_proven(frames, a):
         shares = f"{100 * a.rule:.0f} % of the edges obey the Gray code" if np.isfinite(a.rule) else "no edges are read"
         if np.isfinite(a.common):
             shares += f", {100 * a.common:.0f} % of them fall at one phase"
-        doubts.append((images, f"axis {axis}: {shares}, of {100 * SURE:.0f} % that would be sure"))
+        findings.doubts.append((images, f"axis {axis}: {shares}, of {100 * SURE:.0f} % that would be sure"))
 
 
 def _mark_complementary(sequence: PatternSequence, axis: Axis, image: int) -> PatternSequence:
@@ -399,11 +404,6 @@ def _describe_reversal(axis: Axis, observation: str, other: str) -> str:
     """Return the text of the doubt that an axis is reversed, by a device turned by 180 degrees or by ``other``."""
     side = "to the right" if axis == "x" else "downwards"
     return f"axis {axis}: {observation} {side} in the camera: camera or projector is turned by half a turn, {other}"
-
-
-def _name_lines(axis: Axis) -> str:
-    """Return what a coordinate of an axis counts: "columns" or "rows"."""
-    return "columns" if axis == "x" else "rows"
 
 
 def _replace_axis(values: object, axis: Axis, value: float) -> PerAxis:  # type: ignore[type-arg]

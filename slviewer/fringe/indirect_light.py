@@ -9,17 +9,16 @@ Light that comes from less than a stripe away can be seen by its weak fringes al
 is like that, by nothing.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 from scipy.ndimage import uniform_filter
 
-from slviewer.fringe.layout import Layout
+from slviewer.fringe.decoding_task import DecodingTask
 from slviewer.fringe.phase import Reason
-from slviewer.fringe.sequence import PatternSequence
 from slviewer.geometry.jit import kernel, read_only, run_rows
 
 INDIRECT = np.uint8(Reason.INDIRECT)
+Maps = tuple[np.ndarray, ...]
+"""Phase, wrapped phase, modulation, background and reason, (h, w) each."""
 BIT_SHARE = 0.65
 """Difference between the contrasts of a pixel's bits, as a share of the largest, up to which no bit is misread: that
 takes as much indirect light as direct. Adhesive tape on a board differs by up to a half, and is measured well."""
@@ -59,43 +58,20 @@ MOST_SPREAD = 0.1
 """Of the samples above the fit: where they scatter more, the image does not show the scene under the same light."""
 
 
-@dataclass(frozen=True, eq=False)
-class _Sampled:
-    """``strength`` (n,): log of the fringes' amplitude over half of the white light; ``terms`` (n, 6) of its model."""
-
-    strength: np.ndarray
-    terms: np.ndarray
-
-
-def mask_indirect_light(
-    sequence: PatternSequence,
-    layout: Layout,
-    stack: np.ndarray,
-    white: float,
-    maps: tuple[np.ndarray, ...],
-    noise: tuple[float, float],
-) -> None:
-    """Mask, in place, the pixels of decoded ``maps`` whose frames contradict a single reflection; reason INDIRECT.
-
-    ``maps``: phase, wrapped phase, modulation, background, reason, (h, w) each, of the ``stack`` (n, h, w) that the
-    ``sequence`` and its ``layout`` describe. ``white``: level at which the stack is clipped; ``noise`` (a, b).
-    """
-    phase, _, modulation, background, reason = maps
-    whites = [i for kind in ("texture", "white") for i, frame in enumerate(sequence.frames) if frame.kind == kind]
-    is_narrow = not layout.gray and len(layout.shifts) > 1 and layout.shifts[0].period_px < NARROW * layout.period_px
+def mask_indirect_light(task: DecodingTask, maps: Maps) -> None:
+    """Mask, in place, the pixels of decoded ``maps`` whose frames contradict a single reflection; reason INDIRECT."""
+    layout, phase, reason = task.layout, maps[0], maps[-1]
+    whites = [i for kind in ("texture", "white") for i, frame in enumerate(task.sequence.frames) if frame.kind == kind]
     if layout.steps >= FEWEST_STEPS and whites:
-        weak = _detect_weak_fringes(stack[whites[0]], white, phase, modulation, background, reason, noise, is_narrow)
-        reason[weak] = Reason.INDIRECT
+        reason[_detect_weak_fringes(task, task.stack[whites[0]], maps)] = Reason.INDIRECT
     if layout.gray:
-        _mask_unequal_bits(layout, stack, phase, background, reason, noise)
+        _mask_unequal_bits(task, maps)
     phase[reason == Reason.INDIRECT] = np.nan
 
 
-def _mask_unequal_bits(
-    layout: Layout, stack: np.ndarray, phase: np.ndarray, background: np.ndarray, reason: np.ndarray,
-    noise: tuple[float, float],
-) -> None:  # fmt: skip
+def _mask_unequal_bits(task: DecodingTask, maps: Maps) -> None:
     """Set the reason INDIRECT where bits that have no edge near a pixel differ in black or white."""
+    layout, (phase, _, _, background, reason) = task.layout, maps
     count, cell = len(layout.gray), layout.gray_cell_px
     spans = [cell * 2.0 ** (count - bit) for bit in range(count)]
     frames, inverses = list(layout.gray), list(layout.inverse) or [-1] * count
@@ -110,8 +86,8 @@ def _mask_unequal_bits(
         np.array([inverses[k] for k in wide]),
         np.array([spans[k] for k in wide]),
     )
-    limits = np.array([layout.period_px / (2 * np.pi), layout.gray_origin_px, guard, *noise], np.float64)
-    stack = read_only(stack)
+    limits = np.array([layout.period_px / (2 * np.pi), layout.gray_origin_px, guard, *task.noise], np.float64)
+    stack = read_only(task.stack)
 
     def compare(first: int, last: int) -> None:
         """Compare the bits of a range of rows."""
@@ -149,18 +125,17 @@ def _compare_bits(stack, first, frames, inverses, spans, limits, phase, backgrou
                 reason[i, x] = INDIRECT
 
 
-def _detect_weak_fringes(
-    white_frame: np.ndarray, clipped: float, phase: np.ndarray, modulation: np.ndarray, background: np.ndarray,
-    reason: np.ndarray, noise: tuple[float, float], is_narrow: bool,
-) -> np.ndarray:  # fmt: skip
+def _detect_weak_fringes(task: DecodingTask, white_frame: np.ndarray, maps: Maps) -> np.ndarray:
     """Return (h, w) bool: valid pixels whose fringes are weak for their white light, compared with the image's.
 
     Of sharp fringes the amplitude is half of the white light. Blur makes them weaker: the projector's, which changes
     evenly over a depth range, and the camera's, by the square of the phase's gradient. Both are fitted.
     """
+    layout, noise, (phase, _, modulation, background, reason) = task.layout, task.noise, maps
     nothing = np.zeros(phase.shape, bool)
+    is_narrow = not layout.gray and len(layout.shifts) > 1 and layout.shifts[0].period_px < NARROW * layout.period_px
     share = WEAK_NARROW if is_narrow else WEAK
-    valid = (reason == Reason.VALID) & (white_frame < clipped) & (white_frame > background)
+    valid = (reason == Reason.VALID) & (white_frame < task.white) & (white_frame > background)
     if np.count_nonzero(valid) < FEWEST:
         return nothing
     weight = valid.astype(np.float32)
@@ -178,9 +153,9 @@ def _detect_weak_fringes(
         return nothing
     some = np.s_[:: max(1, len(rows) // SAMPLES)]
     at = rows[some], columns[some]
-    sampled = _Sampled(strength[at], _model_terms(phase, slope, *at))
-    fit, spread = _fit_strength(sampled)
-    typical = float(np.exp(np.median(sampled.terms @ fit)))
+    terms = _model_terms(phase, slope, *at)
+    fit, spread = _fit_strength(strength[at], terms)
+    typical = float(np.exp(np.median(terms @ fit)))
     if not PLAUSIBLE[0] < typical < PLAUSIBLE[1] or spread > MOST_SPREAD:
         return nothing
     if is_narrow:
@@ -214,23 +189,24 @@ def _square_gradient(phase: np.ndarray, valid: np.ndarray) -> np.ndarray:
     return np.where(known, out, mean)
 
 
-def _fit_strength(sampled: _Sampled) -> tuple[np.ndarray, float]:
+def _fit_strength(strength: np.ndarray, terms: np.ndarray) -> tuple[np.ndarray, float]:
     """Fit the terms (6,) to the upper side of the strengths; second, the mean distance of those above the fit.
 
+    ``strength`` (n,): log of the fringes' amplitude over half of the white light; ``terms`` (n, 6) of its model.
     Penalised, so that place and phase, nearly the same on a flat surface, do not cancel to follow indirect light; blur
     never makes the fringes of a steep surface stronger.
     """
-    middle, size = sampled.terms.mean(axis=0), np.maximum(sampled.terms.std(axis=0), 1e-9)
+    middle, size = terms.mean(axis=0), np.maximum(terms.std(axis=0), 1e-9)
     middle[0], size[0] = 0.0, 1.0
-    terms = (sampled.terms - middle) / size
+    terms = (terms - middle) / size
     weight = np.ones(len(terms))
     for _ in range(20):
         penalty = np.diag(PENALTIES) * weight.sum()
-        normal, moment = (terms.T * weight) @ terms + penalty, (terms.T * weight) @ sampled.strength
+        normal, moment = (terms.T * weight) @ terms + penalty, (terms.T * weight) @ strength
         fit = np.linalg.solve(normal, moment)
         if fit[-1] > 0:
             fit = np.append(np.linalg.solve(normal[:-1, :-1], moment[:-1]), 0.0)
-        rest = sampled.strength - terms @ fit
+        rest = strength - terms @ fit
         weight = np.where(rest > 0, UPPER, 1 - UPPER) / np.maximum(np.abs(rest), 0.005)
     above = rest > 0
     slopes = fit / size

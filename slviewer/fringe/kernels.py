@@ -15,6 +15,8 @@ from slviewer.geometry.jit import add_fixed_width, fma, prefetch, subtract_fixed
 VALID, DARK, SATURATED, INCONSISTENT = (
     np.uint8(r) for r in (Reason.VALID, Reason.DARK, Reason.SATURATED, Reason.INCONSISTENT)
 )
+ZERO, HALF, ONE, NAN, ENDLESS = (np.float32(number) for number in (0, 0.5, 1, np.nan, np.inf))
+QUARTER, THREE_QUARTERS = np.float32(0.25), np.float32(0.75)
 PER_TURN = np.float32(1 / (2 * np.pi))
 TURN = np.float32(6.28125)
 TURN_REST = np.float32(2 * np.pi - 6.28125)
@@ -202,7 +204,7 @@ def shift_row(stack, shift, row, wrapped, modulation, background, peak):
     sums_row(stack, shift, row, cosine, sine, total, peak)
     per_two, per_one, counted = np.float32(2 / shift.steps), np.float32(1 / shift.steps), np.float32(shift.counted)
     for x in range(width):
-        wrapped[x] = arctan2(np.float32(0) - sine[x], cosine[x])
+        wrapped[x] = arctan2(ZERO - sine[x], cosine[x])
         modulation[x] = np.sqrt(fma(cosine[x], cosine[x], sine[x] * sine[x])) * per_two
         level = np.float32(first[x])
         background[x] = fma(total[x] - counted * level, per_one, level)
@@ -244,7 +246,7 @@ def bit_height(stack, frames, inverses, bit, row, x, threshold):
     """Return the grey levels by which a Gray bit is above its threshold."""
     value = np.float32(stack[frames[bit], row, x])
     if len(inverses):
-        return (value - np.float32(stack[inverses[bit], row, x])) * np.float32(0.5)
+        return (value - np.float32(stack[inverses[bit], row, x])) * HALF
     return value - threshold
 
 

@@ -7,9 +7,16 @@ import numpy as np
 
 from slviewer.fringe import limits
 from slviewer.fringe.kernels import (
+    ENDLESS,
+    HALF,
+    NAN,
+    ONE,
     PER_TURN,
+    QUARTER,
+    THREE_QUARTERS,
     TURN,
     TURN_REST,
+    ZERO,
     Scale,
     Shifts,
     allocate_five,
@@ -66,29 +73,40 @@ def code_row(stack, frames, inverses, row, threshold, code, least, top, bottom, 
     From k - 1 to k the Gray bit changes at whose place k has its last binary 1; from k to k + 1 that of its last 0. A
     code without such a bit has no such edge: infinite.
     """
+    if len(inverses):
+        opposed_code_row(stack, frames, inverses, row, code, least, top, bottom, lower, upper)
+    else:
+        plain_code_row(stack, frames, row, threshold, code, least, top, bottom, lower, upper)
+
+
+@numba.njit(inline="always")
+def opposed_code_row(stack, frames, inverses, row, code, least, top, bottom, lower, upper):
+    """Read the binary code of one image row from bits and their inverses, see `code_row`."""
     width = stack.shape[2]
-    none, nothing = np.float32(np.inf), np.float32(0)
+    digits = np.zeros(width, np.uint8)
     for x in range(width):
         code[x] = 0
-    if len(inverses):
-        digits = np.zeros(width, np.uint8)
+        top[x] = bottom[x] = ZERO
+        least[x] = lower[x] = upper[x] = ENDLESS
+    for b in range(len(frames)):
+        frame, inverse = stack[frames[b], row], stack[inverses[b], row]
         for x in range(width):
-            top[x] = bottom[x] = nothing
-            least[x] = lower[x] = upper[x] = none
-        for b in range(len(frames)):
-            frame, inverse = stack[frames[b], row], stack[inverses[b], row]
-            for x in range(width):
-                height = (np.float32(frame[x]) - np.float32(inverse[x])) * np.float32(0.5)
-                one = np.uint8(digits[x] ^ np.uint8(height > 0))
-                at_lower, at_upper = lower[x], upper[x]
-                digits[x] = one
-                code[x] = np.int32(np.int32(code[x] + code[x]) | np.int32(one))
-                least[x] = min(least[x], abs(height))
-                top[x] = max(top[x], height)
-                bottom[x] = min(bottom[x], height)
-                lower[x] = height if one != 0 else at_lower
-                upper[x] = at_upper if one != 0 else height
-        return
+            height = (np.float32(frame[x]) - np.float32(inverse[x])) * HALF
+            one = np.uint8(digits[x] ^ np.uint8(height > 0))
+            at_lower, at_upper = lower[x], upper[x]
+            digits[x] = one
+            code[x] = np.int32(np.int32(code[x] + code[x]) | np.int32(one))
+            least[x] = min(least[x], abs(height))
+            top[x] = max(top[x], height)
+            bottom[x] = min(bottom[x], height)
+            lower[x] = height if one != 0 else at_lower
+            upper[x] = at_upper if one != 0 else height
+
+
+@numba.njit(inline="always")
+def plain_code_row(stack, frames, row, threshold, code, least, top, bottom, lower, upper):
+    """Read the binary code of one image row from bits and their threshold, see `code_row`."""
+    width = stack.shape[2]
     # Against one threshold the frames' own numbers can be compared: four times as many fit a register.
     grey = stack.dtype.type
     full = grey(65535 if stack.itemsize == 2 else 255)
@@ -100,7 +118,7 @@ def code_row(stack, frames, inverses, row, threshold, code, least, top, bottom, 
         level[x] = grey(np.int32(threshold[x]))
         over_least[x] = fewest[x] = full
         under_most[x] = most[x] = at_one[x] = at_nought[x] = grey(0)
-        bits[x] = 0
+        bits[x] = code[x] = 0
     for start in range(0, len(frames), 8):
         last = min(start + 8, len(frames))
         if (last - start) % 2:
@@ -133,17 +151,17 @@ def code_row(stack, frames, inverses, row, threshold, code, least, top, bottom, 
             code[x] = np.int32(np.int32(code[x] * more) + np.int32(np.uint8(bits[x] & held)))
     for x in range(width):
         level_x, nearest_over, nearest_under = threshold[x], np.float32(over_least[x]), np.float32(under_most[x])
-        above = nearest_over - level_x if most[x] > level[x] else none
-        below = level_x - nearest_under if fewest[x] <= level[x] else none
+        above = nearest_over - level_x if most[x] > level[x] else ENDLESS
+        below = level_x - nearest_under if fewest[x] <= level[x] else ENDLESS
         least[x] = min(above, below)
     for x in range(width):
         level_x, highest, lowest = threshold[x], np.float32(most[x]), np.float32(fewest[x])
-        top[x], bottom[x] = max(nothing, highest - level_x), min(nothing, lowest - level_x)
+        top[x], bottom[x] = max(ZERO, highest - level_x), min(ZERO, lowest - level_x)
     ones = np.int32((1 << len(frames)) - 1)
     for x in range(width):
         level_x, one_x, nought_x = threshold[x], np.float32(at_one[x]), np.float32(at_nought[x])
-        lower[x] = one_x - level_x if code[x] != 0 else none
-        upper[x] = nought_x - level_x if code[x] != ones else none
+        lower[x] = one_x - level_x if code[x] != 0 else ENDLESS
+        upper[x] = nought_x - level_x if code[x] != ones else ENDLESS
 
 
 @numba.njit(inline="always")
@@ -158,7 +176,6 @@ def coded_row(stack, row, scale, rules, psi, B, A, peak, code, buffers, phase, r
     origin = np.float32(rules.origin_turns)
     per_mean, per_rest = np.float32(1 / rules.mean), np.float32(1 / (1 - rules.mean))
     off_middle = np.float32(0.5 - rules.mean)
-    none, quarter = np.float32(np.nan), np.float32(0.25)
     if rules.complementary >= 0:
         extra = stack[rules.complementary, row]
         for x in range(width):
@@ -167,15 +184,15 @@ def coded_row(stack, row, scale, rules, psi, B, A, peak, code, buffers, phase, r
             part = turns - whole
             last = np.float32(extra[x]) - A[x]
             cell = np.int32(np.int32(code[x] + code[x]) + np.int32(np.int32(code[x] & 1) ^ np.int32(last > 0)))
-            middle = (part >= quarter) & (part < np.float32(0.75))
-            beside = np.int32(np.int32(np.int32(cell + 1) >> 1) - np.int32(part >= np.float32(0.75)))
+            middle = (part >= QUARTER) & (part < THREE_QUARTERS)
+            beside = np.int32(np.int32(np.int32(cell + 1) >> 1) - np.int32(part >= THREE_QUARTERS))
             order = np.int32(cell >> 1) if middle else beside
             unclear = (least[x] if middle else abs(last)) < UNDECIDED * B[x]
             dark, clipped = is_dark(B[x], A[x], scale), is_clipped(B[x], A[x], peak[x], scale)
             reason[x] = select_reason(dark, clipped, unclear)
             periods = np.float32(order) - whole
             absolute = fma(periods, TURN, fma(periods, TURN_REST, psi[x]))
-            phase[x] = none if dark | clipped | unclear else absolute
+            phase[x] = NAN if dark | clipped | unclear else absolute
     else:
         for x in range(width):
             turns = psi[x] * PER_TURN - origin
@@ -185,15 +202,15 @@ def coded_row(stack, row, scale, rules, psi, B, A, peak, code, buffers, phase, r
             dark, clipped = is_dark(B[x], A[x], scale), is_clipped(B[x], A[x], peak[x], scale)
             reason[x] = select_reason(dark, clipped, unclear)
             # On a blurred edge the bit nearest the middle and the phase may disagree about the side: the phase decides.
-            contrast = max(top[x] * per_rest, np.float32(0) - bottom[x] * per_mean)
+            contrast = max(top[x] * per_rest, ZERO - bottom[x] * per_mean)
             below, above = abs(lower[x] - off_middle * contrast), abs(upper[x] - off_middle * contrast)
             ahead = (part < EDGE) & (above < WEAK * contrast) & (above < WEAKER * below)
             behind = (part >= FAR_EDGE) & (below < WEAK * contrast) & (below < WEAKER * above)
             periods = np.float32(code[x]) - whole
-            periods += np.float32(1) if ahead else np.float32(0)
-            periods -= np.float32(1) if behind else np.float32(0)
+            periods += ONE if ahead else ZERO
+            periods -= ONE if behind else ZERO
             absolute = fma(periods, TURN, fma(periods, TURN_REST, psi[x]))
-            phase[x] = none if dark | clipped | unclear else absolute
+            phase[x] = NAN if dark | clipped | unclear else absolute
 
 
 @kernel()

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from slviewer.fringe import limits
-from slviewer.fringe.kernels import Scale, bit_height, is_dark, select_reason
+from slviewer.fringe.kernels import HALF, NAN, ZERO, Scale, bit_height, is_dark, select_reason
 from slviewer.geometry.jit import kernel, read_only, run_rows
 
 TWO_PI = 2 * np.pi
@@ -45,10 +45,10 @@ def _decode_gray_rows(start, stop, stack, scale, rules, phase, wrapped, modulati
     per_px = TWO_PI / rules.cell
     for row in range(start, stop):
         for x in range(width):
-            B, A = np.float32(0), np.float32(0)
+            B, A = ZERO, ZERO
             if white >= 0 and black >= 0:
                 bright, dim = np.float32(stack[white, row, x]), np.float32(stack[black, row, x])
-                B, A = (bright - dim) * np.float32(0.5), (bright + dim) * np.float32(0.5)
+                B, A = (bright - dim) * HALF, (bright + dim) * HALF
             else:
                 for b in range(len(gray)):
                     bright, dim = np.float32(stack[gray[b], row, x]), np.float32(stack[inverse[b], row, x])
@@ -67,7 +67,7 @@ def _decode_gray_rows(start, stop, stack, scale, rules, phase, wrapped, modulati
                 code, other = 2 * code + bit, 2 * other + flipped
                 doubts += doubt
             unclear = doubts > 1 or abs(code - other) > 1
-            modulation[row, x], background[row, x], wrapped[row, x] = B, A, np.float32(np.nan)
+            modulation[row, x], background[row, x], wrapped[row, x] = B, A, NAN
             dark = (doubts >= limits.DARK_BITS) | is_dark(B, A, scale)
             reason[row, x] = select_reason(dark, False, unclear)
             start, end = (
@@ -76,4 +76,4 @@ def _decode_gray_rows(start, stop, stack, scale, rules, phase, wrapped, modulati
             )
             first, last = max(start, -0.5), min(end, rules.high)
             centre = 0.5 * (first + last if first < last else start + end)
-            phase[row, x] = np.float32(np.nan) if dark | unclear else np.float32(per_px * centre)
+            phase[row, x] = NAN if dark | unclear else np.float32(per_px * centre)

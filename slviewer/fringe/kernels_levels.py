@@ -6,8 +6,12 @@ import numba
 import numpy as np
 
 from slviewer.fringe.kernels import (
+    ENDLESS,
+    HALF,
+    NAN,
     TURN,
     TURN_REST,
+    ZERO,
     Scale,
     Shifts,
     allocate_five,
@@ -46,6 +50,21 @@ class Ladder(NamedTuple):
     mean: float
 
 
+@numba.njit(inline="always")
+def read_cell_bits(stack, row, x, threshold, bits, inverses, heights):
+    """Read the Gray bits of a pixel, whose ``heights`` (b,) it fills; return their code, the highest and the lowest."""
+    code, bit, top, bottom = 0, 0, ZERO, ZERO
+    for b in range(len(bits)):
+        value = np.float32(stack[bits[b], row, x])
+        height = value - threshold
+        if inverses[b] >= 0:
+            height = (value - np.float32(stack[inverses[b], row, x])) * HALF
+        bit ^= int(height > 0)
+        code = 2 * code + bit
+        heights[b], top, bottom = height, max(top, height), min(bottom, height)
+    return code, top, bottom
+
+
 @numba.njit
 def cell_row(stack, row, B, A, ladder, heights, cell, worst):
     """Compute the coordinates px of the cells of one row that the bits number, or of the border that a pixel is at.
@@ -55,27 +74,19 @@ def cell_row(stack, row, B, A, ladder, heights, cell, worst):
     """
     bits, inverses = ladder.bits, ladder.inverses
     last = len(bits) - 1
-    mean, half, nothing = np.float32(ladder.mean), np.float32(0.5), np.float32(0)
+    mean = np.float32(ladder.mean)
     for x in range(len(cell)):
-        code, bit, top, bottom = 0, 0, nothing, nothing
-        for b in range(len(bits)):
-            value = np.float32(stack[bits[b], row, x])
-            height = value - A[x]
-            if inverses[b] >= 0:
-                height = (value - np.float32(stack[inverses[b], row, x])) * half
-            bit ^= int(height > 0)
-            code = 2 * code + bit
-            heights[b], top, bottom = height, max(top, height), min(bottom, height)
+        code, top, bottom = read_cell_bits(stack, row, x, A[x], bits, inverses, heights)
         contrast = max(top / (1 - mean), -bottom / mean)
-        middle = (half - mean) * contrast
+        middle = (HALF - mean) * contrast
         zeros, ones = 0, 0
         while zeros <= last and not (code >> zeros) & 1:
             zeros += 1
         while ones <= last and (code >> ones) & 1:
             ones += 1
-        lower = abs(heights[last - zeros] - middle) if zeros <= last else np.float32(np.inf)
-        upper = abs(heights[last - ones] - middle) if ones <= last else np.float32(np.inf)
-        least = np.float32(np.inf)
+        lower = abs(heights[last - zeros] - middle) if zeros <= last else ENDLESS
+        upper = abs(heights[last - ones] - middle) if ones <= last else ENDLESS
+        least = ENDLESS
         for b in range(len(bits)):
             if b != last - zeros and b != last - ones:
                 least = min(least, abs(heights[b]))
@@ -86,7 +97,7 @@ def cell_row(stack, row, B, A, ladder, heights, cell, worst):
         elif lower < near and lower < WEAKER * upper:
             part = 0.0
         cell[x] = ladder.origin + ladder.cell * (code + part)
-        worst[x] = np.float32(np.inf) if least < UNDECIDED * B[x] else nothing
+        worst[x] = ENDLESS if least < UNDECIDED * B[x] else ZERO
 
 
 @numba.njit(inline="always")
@@ -113,7 +124,7 @@ def levels_row(psi, ladder, weakest, A, clipped, scale, cell, coordinate, order,
         else:  # the beat of some
             source, per_rad = own, np.float32(to_px)
             for x in range(width):
-                own[x] = np.float32(0)
+                own[x] = ZERO
             for i in range(count):
                 weight, wrapped = np.float32(ladder.weights[level, i]), psi[i]
                 for x in range(width):
@@ -130,8 +141,8 @@ def levels_row(psi, ladder, weakest, A, clipped, scale, cell, coordinate, order,
         elif level == 0:
             for x in range(width):
                 position = source[x] * per_rad
-                whole = np.float32(0) - np.floor((position - low) * per_px)
-                order[x], worst[x] = whole, np.float32(0)
+                whole = ZERO - np.floor((position - low) * per_px)
+                order[x], worst[x] = whole, ZERO
                 coordinate[x] = fma(whole, length, position)
         else:
             for x in range(width):
@@ -146,7 +157,7 @@ def levels_row(psi, ladder, weakest, A, clipped, scale, cell, coordinate, order,
         dark, unclear = is_dark_squared(weakest[x], A[x], scale), worst[x] > misfit
         reason[x] = select_reason(dark, clipped[x], unclear)
         absolute = fma(order[x], TURN, fma(order[x], TURN_REST, finest[x]))
-        phase[x] = np.float32(np.nan) if dark | clipped[x] | unclear else absolute
+        phase[x] = NAN if dark | clipped[x] | unclear else absolute
 
 
 @numba.njit(inline="always")
@@ -168,18 +179,18 @@ def phases_row(stack, shifts, scale, row, psi, out, B, A, peak, buffers):
     clipped, weakest, _, _, _, _, cosine, sine, total = buffers
     width, white = stack.shape[2], np.float32(scale.white)
     for x in range(width):
-        weakest[x], clipped[x] = np.float32(np.inf), False
+        weakest[x], clipped[x] = ENDLESS, False
     for i in range(len(shifts.steps)):  # the finest is last, and its values stay
         steps = select_period(shifts, i)
         sums_row(stack, steps, row, cosine, sine, total, peak)
         first, wrapped = stack[steps.first, row], psi[i]
         per_two, per_one, counted = np.float32(2 / steps.steps), np.float32(1 / steps.steps), np.float32(steps.counted)
         for x in range(width):
-            wrapped[x] = arctan2(np.float32(0) - sine[x], cosine[x])
+            wrapped[x] = arctan2(ZERO - sine[x], cosine[x])
             level = np.float32(first[x])
             middle = fma(total[x] - counted * level, per_one, level)
             squared = fma(cosine[x], cosine[x], sine[x] * sine[x]) * (per_two * per_two)
-            rest = max(white - middle, np.float32(0))
+            rest = max(white - middle, ZERO)
             A[x] = middle
             weakest[x] = min(weakest[x], squared)
             clipped[x] |= (np.float32(peak[x]) >= white) & (squared >= rest * rest)

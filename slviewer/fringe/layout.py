@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slviewer.errors import InputError
-from slviewer.fringe.sequence import Axis, Kind, PatternSequence
+from slviewer.fringe.sequence import Axis, Indices, PatternSequence
 
 WHITE_LEVELS = (255, 1023, 4095, 16383, 65535)
 """Full scale of the cameras whose grey levels arrive as uint16."""
@@ -23,7 +23,7 @@ class Shift:
     """Period (px) of a phase shift, and the indices of its frames by step."""
 
     period_px: float
-    indices: tuple[int, ...]
+    indices: Indices
 
 
 @dataclass(frozen=True)
@@ -40,8 +40,8 @@ class Layout:
     sign: int
     gray_origin_px: float
     shifts: tuple[Shift, ...]
-    gray: tuple[int, ...]
-    inverse: tuple[int, ...]
+    gray: Indices
+    inverse: Indices
     complementary: int | None
     white: int | None
     black: int | None
@@ -88,8 +88,8 @@ def axis_layout(sequence: PatternSequence, axis: Axis) -> Layout:
         there = f"use axis {sequence.axes[0]}" if sequence.axes else "phase steps or Gray bits are needed"
         raise InputError(f"no frame carries a pattern along axis {axis}: {there}")
     shifts = tuple(Shift(*shift) for shift in sequence.phase_shifts(axis))
-    gray, inverse, complementary, white, black = (
-        _list_frames_by_bit(sequence, axis, kind) for kind in ("gray", "inverse", "complementary", "white", "black")
+    complementary, white, black = (
+        next(iter(sequence.find(kind, axis)), None) for kind in ("complementary", "white", "black")
     )
     layout = Layout(
         axis,
@@ -97,18 +97,18 @@ def axis_layout(sequence: PatternSequence, axis: Axis) -> Layout:
         sequence.sign(axis),
         sequence.origin_px(axis),
         shifts,
-        gray,
-        inverse,
-        complementary[0] if complementary else None,
-        white[0] if white else None,
-        black[0] if black else None,
+        sequence.bits("gray", axis),
+        sequence.bits("inverse", axis),
+        complementary,
+        white,
+        black,
         sequence.offset_rad(axis),
         sequence.gray_cell(axis),
         sequence.relative or sequence.projector_size is None,
     )
-    if not shifts and not inverse and not (white and black):
+    if not (shifts or layout.inverse or None not in (white, black)):
         raise InputError(f"axis {axis}: Gray code alone needs its inverses, or a white and a black frame: add them")
-    if gray or complementary:
+    if layout.gray or complementary is not None:
         _check_code(layout)
     return layout
 
@@ -167,11 +167,6 @@ def to_eight_bits(image: np.ndarray, full_scale: float | None = None, largest: i
     if white >> shift < 255:  # not all bits are used
         return np.asarray(cv2.convertScaleAbs(image, alpha=255 / white), np.uint8)
     return np.minimum(image >> shift, 255).astype(np.uint8)
-
-
-def _list_frames_by_bit(sequence: PatternSequence, axis: Axis, kind: Kind) -> tuple[int, ...]:
-    """Return the indices of the frames of one kind, the most significant bit first."""
-    return tuple(sorted(sequence.find(kind, axis), key=lambda i: sequence.frames[i].bit))
 
 
 def _check_code(layout: Layout) -> None:

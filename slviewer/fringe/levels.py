@@ -88,21 +88,19 @@ def plan_levels(periods_px: tuple[float, ...], extent: float) -> tuple[Level, ..
     singles = [_combine_periods(periods_px, {i: 1}) for i in range(len(periods_px))]
     if periods_px[0] >= extent:
         return tuple(singles)
-    every = [_combine_periods(periods_px, {j: 1, i: -1}) for i, j in combinations(range(len(periods_px)), 2)]
+    every = _list_beats(periods_px)
     covering = [beat for beat in every if extent <= beat.period_px < np.inf]
     if len(periods_px) > LONGEST and covering:
         return (*_chain_beats(min(covering, key=lambda level: level.period_px), every, singles[0]), *singles)
-    count = min(LONGEST, len(periods_px))
-    beats = [_combine_periods(periods_px, {j: 1, i: -1}) for i, j in combinations(range(count), 2)]
+    beats = _list_beats(periods_px, LONGEST)
     covering = [beat for beat in beats if beat.period_px >= extent]
     if covering:
         return (min(covering, key=lambda level: level.period_px), *singles)
-    if count == LONGEST:
-        both = [_combine_periods(periods_px, {0: 1, 1: -2, 2: 1})]
-        both = [level for level in both if extent <= level.period_px < np.inf]
-        if both:
+    if len(periods_px) >= LONGEST:
+        both = _combine_periods(periods_px, {0: 1, 1: -2, 2: 1})
+        if extent <= both.period_px < np.inf:
             beat = min(beats, key=lambda level: level.period_px if level.weights[1] else np.inf)
-            return (both[0], beat, *singles)
+            return (both, beat, *singles)
     reached = max([periods_px[0], *(beat.period_px for beat in beats)])
     raise InputError(
         f"fringe periods of {_join_periods(periods_px)} px tell only {reached:.0f} px apart, not {extent:g}"
@@ -151,9 +149,8 @@ def find_common_range(periods_px: tuple[float, ...]) -> float:
 
     It is the longest period or a beat of two. Raises InputError where no such range holds whole numbers of all periods.
     """
-    count = min(LONGEST, len(periods_px))
-    beats = [_combine_periods(periods_px, {j: 1, i: -1}).period_px for i, j in combinations(range(count), 2)]
-    for reach in sorted({periods_px[0], *beats}, reverse=True):
+    beats = _list_beats(periods_px, LONGEST)
+    for reach in sorted({periods_px[0], *(beat.period_px for beat in beats)}, reverse=True):
         turns = reach / np.array(periods_px)
         if reach < np.inf and (np.abs(turns - np.rint(turns)) <= WHOLE).all():
             return float(reach)
@@ -177,6 +174,12 @@ def required_modulation(levels: tuple[Level, ...], steps: int) -> float:
         default=0.0,
     )
     return float(spread * np.sqrt(2 / steps) / (2 * np.pi * LEVEL_SIGMA))
+
+
+def _list_beats(periods_px: tuple[float, ...], most: int | None = None) -> list[Level]:
+    """Return the beats of two of the periods, of the ``most`` longest ones if given."""
+    pairs = combinations(range(len(periods_px))[:most], 2)
+    return [_combine_periods(periods_px, {j: 1, i: -1}) for i, j in pairs]
 
 
 def _join_periods(periods_px: tuple[float, ...]) -> str:

@@ -9,13 +9,21 @@ Gauss-Newton steps (variable projection), with priors where the frames do not de
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
+from itertools import compress
 from typing import Literal
 
 import numpy as np
 from scipy.linalg import block_diag
 
 from slviewer.fringe.light_sample import LightSample
-from slviewer.fringe.residual_sample import cosine_columns, fit_common_harmonics, fit_cosine
+from slviewer.fringe.residual_sample import (
+    ONE_SIDED,
+    cosine_columns,
+    fit_common_harmonics,
+    fit_cosine,
+    measure_concentration,
+)
+from slviewer.fringe.sequence import Indices
 
 Term = Literal["gain", "wave", "uniform", "albedo"]
 
@@ -36,8 +44,7 @@ COMMON = 1e4
 HARMONIC_PRIOR = 0.1
 HARMONIC_STEPS = 4
 """Largest number n of steps for which the fringe's harmonic n is significant in the background."""
-ONE_SIDED = 0.5
-"""Length of the mean unit phasor above which a shift's pixels do not cover all phases."""
+
 MIN_ENTRIES = 0.03
 """Share of the sampled pixels that must be inside a coded frame's bright stripes."""
 MAX_STEPS = 6
@@ -65,23 +72,26 @@ class Light:
     cycles: float
     uniform: np.ndarray
     albedo: np.ndarray
-    changes: tuple[int, ...] = ()
+    changes: Indices = ()
 
     @classmethod
-    def constant(cls, count: int, cycles: float = 0.0) -> "Light":
+    def constant(cls, count: int) -> "Light":
         """Return equal light for ``count`` frames."""
-        return cls(np.ones(count), np.zeros((count, 2)), cycles, np.zeros(count), np.zeros((count, 3)))
+        return cls(np.ones(count), np.zeros((count, 2)), 0.0, np.zeros(count), np.zeros((count, 3)))
 
     @property
-    def key(self) -> tuple[bytes | float | tuple[int, ...], ...]:
+    def key(self) -> tuple[bytes | float | Indices, ...]:
         """Key of the values that equalized frames depend on, the same for equal lights."""
-        varies = bool(self.uniform.any() or self.albedo.any())
-        values = (self.gain, self.wave, self.uniform, self.albedo)
         return (
-            *(part.tobytes() for part in values),
+            *(part.tobytes() for part in (self.gain, self.wave, self.uniform, self.albedo)),
             self.cycles if self.wave.any() else 0.0,
-            self.changes if varies else (),
+            self.changes if self.uniform.any() or self.albedo.any() else (),
         )
+
+    def values(self, term: Term, frames: Sequence[int]) -> np.ndarray:
+        """Return the values (u, k) of a term in some frames, of the gain its logarithm."""
+        values = getattr(self, term)[frames].reshape(len(frames), -1)
+        return np.asarray(np.log(values) if term == "gain" else values)
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +107,7 @@ class Fit:
     variance: float
     share: float
     weight: np.ndarray
-    informed: tuple[int, ...]
+    informed: Indices
 
 
 def fit_light(
@@ -112,8 +122,7 @@ def fit_light(
     ``start``: initial light, which also defines the wave's cycles; ``weight`` (p,): fixed weight of each pixel, robust
     weights if None; ``most_steps``: number of steps at most.
     """
-    light, share = start, SHARE_PRIOR[0]
-    fixed = weight
+    light, share, is_fixed = start, SHARE_PRIOR[0], weight is not None
     weight = np.ones(sample.frames.shape[1], np.float32) if weight is None else weight
     variance = max(sample.roughness**2, 1 / 12)
     model = light_model(sample)
@@ -122,7 +131,7 @@ def fit_light(
         variance = max(remainder.variance, 1e-3)
         change, share_change = remainder.solve(light, terms, variance, share)
         light, share = _update_light(light, change, model), float(np.clip(share + share_change, 0.05, 0.95))
-        if fixed is None:
+        if not is_fixed:
             weight = remainder.robust_weight()
         if all(np.abs(values).max() < CONVERGED * remainder.scale(term) for term, values in change.items()):
             break
@@ -153,21 +162,18 @@ def _compute_row_wave(sample: LightSample, cycles: float) -> tuple[np.ndarray, n
 
 def _update_light(light: Light, change: dict[Term, np.ndarray], model: "LightModel") -> Light:
     """Return the light after a step; frames that the sample does not determine change like the mean of the others."""
-    gain, wave, uniform, albedo = light.gain.copy(), light.wave.copy(), light.uniform.copy(), light.albedo.copy()
     used, known = model.used, np.isin(model.used, model.informed)
-    for term in ("gain", "wave"):
-        if term in change:
-            values = change[term]
-            change[term] = np.where(known[:, None], values - values[known].mean(axis=0), 0)
-    if "gain" in change:
-        gain[used] *= np.exp(np.clip(change["gain"][:, 0], -0.5, 0.5))
-    if "wave" in change:
-        wave[used] += change["wave"]
-    if "uniform" in change:
-        uniform[used] += change["uniform"][:, 0]
-    if "albedo" in change:
-        albedo[used] += change["albedo"]
-    return replace(light, gain=gain, wave=wave, uniform=uniform, albedo=albedo)
+    values: dict[str, np.ndarray] = {}
+    for term, step in change.items():
+        if term in ("gain", "wave"):
+            change[term] = step = np.where(known[:, None], step - step[known].mean(axis=0), 0)
+        values[term] = getattr(light, term).copy()
+        step = step.reshape(values[term][used].shape)
+        if term == "gain":
+            values[term][used] *= np.exp(np.clip(step, -0.5, 0.5))
+        else:
+            values[term][used] += step
+    return replace(light, **values)  # type: ignore[arg-type]
 
 
 @lru_cache(maxsize=2)
@@ -192,38 +198,28 @@ class LightModel:
         self.phased = [i for shift in sample.shifts for i in shift]
         self.used = [*self.phased, *sample.coded]
         n = len(self.phased)
-        parts, first = [np.ones((n, 1))], 0
-        self.places, self.turning = [], []
+        parts, first = [], 0
+        self.places, self.turning, self.determined = list[slice](), list[bool](), list[int]()
         for shift in sample.shifts:
             steps = len(shift)
             place = slice(first, first + steps)
-            phasor = fit_cosine(sample.frames[list(shift)])[1]
-            turning = abs(complex(np.mean(phasor / np.maximum(np.abs(phasor), 1e-6)))) < ONE_SIDED
+            turning = measure_concentration(fit_cosine(sample.frames[list(shift)])[1]) < ONE_SIDED
             # If only part of the phases is in view, harmonics cannot be separated from light: its frames are free.
-            part = np.zeros((n, 2 if turning else steps))
-            part[place] = cosine_columns(np.arange(steps), steps, 1)[:, 1:] if turning else np.eye(steps)
-            parts.append(part)
+            parts.append(cosine_columns(np.arange(steps), steps, 1)[:, 1:] if turning else np.eye(steps))
             self.places.append(place)
             self.turning.append(turning)
+            self.determined += range(n)[place] if turning else []
             first += steps
-        self.determined = [
-            k for place, turning in zip(self.places, self.turning, strict=True) if turning for k in range(n)[place]
-        ]
-        design = np.concatenate(parts, axis=1)
+        design = np.hstack([np.ones((n, 1)), block_diag(*parts) if n else np.zeros((0, 0))])
         basis, sizes, _ = np.linalg.svd(design, full_matrices=False) if n else (design, np.zeros(0), None)
         basis = basis[:, sizes > 1e-9]
         self.keep = np.eye(n) - basis @ basis.T
         self.phase_freedom = n - basis.shape[1]
-        least = MIN_ENTRIES * sample.frames.shape[1]
-        is_informed = (sample.interior & sample.bright).sum(
-            axis=1
-        ) >= least  # dark stripes alone hardly depend on the gain
         self.classes = [sample.interior & ~sample.bright, sample.interior & sample.bright]
         self.counts = [members.sum(axis=0).astype(np.float32) for members in self.classes]
-        self.informed = (
-            *(self.phased[k] for k in self.determined),
-            *(i for i, enough in zip(sample.coded, is_informed, strict=True) if enough),
-        )
+        # Dark stripes alone hardly depend on the gain.
+        is_informed = self.classes[1].sum(axis=1) >= MIN_ENTRIES * sample.frames.shape[1]
+        self.informed = (*(self.phased[k] for k in self.determined), *compress(sample.coded, is_informed))
 
     def eliminate(self, light: Light, share: float, weight: np.ndarray) -> "Remainder":
         """Eliminate pattern and surface from the frames under a light; the residual contains only light and noise.
@@ -244,20 +240,19 @@ class LightModel:
         frames, gain = equalize_sample(sample, light, self.used)
         shown, left = np.zeros_like(frames), np.zeros_like(frames)
         harmonics: list[tuple[slice, np.ndarray]] = []
-        if n:
-            phases = frames[:n].copy()
-            for place, shift, turning in zip(self.places, sample.shifts, self.turning, strict=True):
-                phasor = fit_cosine(phases[place])[1]
-                strength = np.abs(phasor)
-                unit = phasor / np.maximum(strength, 1e-6)
-                steps = len(shift)
-                if steps > 3 and turning:
-                    phases[place] -= fit_common_harmonics(phases[place], phasor, 1)
-                if steps <= HARMONIC_STEPS and turning:  # it looks like a change of the background
-                    wave = (strength * unit**steps).astype(np.complex64)
-                    harmonics += [(place, np.tile(part, (steps, 1))) for part in (wave.real, wave.imag)]
-            left[:n] = self.keep.astype(np.float32) @ phases
-            shown[:n] = phases - left[:n]
+        phases = frames[:n].copy()
+        for place, shift, turning in zip(self.places, sample.shifts, self.turning, strict=True):
+            phasor = fit_cosine(phases[place])[1]
+            strength = np.abs(phasor)
+            unit = phasor / np.maximum(strength, 1e-6)
+            steps = len(shift)
+            if steps > 3 and turning:
+                phases[place] -= fit_common_harmonics(phases[place], phasor, 1)
+            if steps <= HARMONIC_STEPS and turning:  # it looks like a change of the background
+                wave = (strength * unit**steps).astype(np.complex64)
+                harmonics += [(place, np.tile(part, (steps, 1))) for part in (wave.real, wave.imag)]
+        left[:n] = self.keep.astype(np.float32) @ phases
+        shown[:n] = phases - left[:n]
         levels = []
         for members, count in zip(self.classes, self.counts, strict=True):
             level = (frames[n:] * members).sum(axis=0) / np.maximum(count, 1)
@@ -311,8 +306,12 @@ class Remainder:
     @property
     def freedom(self) -> float:
         """Weighted degrees of freedom of the residual."""
-        entries = sum(np.maximum(count - 1, 0) for count in self.counts)
-        return float(np.sum(self.weight * (self.model.phase_freedom + entries)))
+        return float(np.sum(self.weight * self._pixel_freedom))
+
+    @cached_property
+    def _pixel_freedom(self) -> np.ndarray:
+        """Degrees of freedom (p,) of each pixel's residual."""
+        return np.asarray(self.model.phase_freedom + sum(np.maximum(count - 1, 0) for count in self.counts))
 
     @property
     def variance(self) -> float:
@@ -338,8 +337,7 @@ class Remainder:
 
     def robust_weight(self) -> np.ndarray:
         """Return the weight (p,) float32 of each pixel, small for outliers."""
-        entries = sum(np.maximum(count - 1, 0) for count in self.counts)
-        freedom = self.model.phase_freedom + entries
+        freedom = self._pixel_freedom
         ratio = (self.left**2).sum(axis=0) / np.maximum(freedom, 1)
         usual = float(np.median(ratio[freedom > 0])) if (freedom > 0).any() else 0.0
         return (1 / (1 + (ratio / max(OUTLIER * usual, 1e-6)) ** 2)).astype(np.float32)
@@ -387,11 +385,10 @@ class Remainder:
         )
         k, c, p = len(R), u - n, len(self.weight)
         total, at_harmonics = k * u, slice(k * u, k * u + len(self.harmonics))
-        classes = list(zip(model.classes, (1 - share, share), strict=True))
         # How a frame's change moves the link: through the background, and through the levels of dark and bright.
         reach = np.zeros_like(self.shown)
         reach[model.determined] = 1 / max(len(model.determined), 1)
-        for (members, part), count in zip(classes, self.counts, strict=True):
+        for members, part, count in zip(model.classes, (1 - share, share), self.counts, strict=True):
             reach[n:] -= part * members / np.maximum(count, 1)
         waves = [wave.sum(axis=0) / len(model.determined) for _, wave in self.harmonics]
         moved = np.concatenate([(R * reach).reshape(total, p), np.array(waves).reshape(-1, p), self.contrast[None]])
@@ -403,7 +400,7 @@ class Remainder:
         blocks = np.zeros((k, u, k, u))
         phased = weighted[:, :n].reshape(k * n, p) @ R[:, :n].reshape(k * n, p).T
         blocks[:, :n, :, :n] = model.keep[:, None] * phased.reshape(k, n, k, n)
-        for members, count in zip((members for members, _ in classes), self.counts, strict=True):
+        for members, count in zip(model.classes, self.counts, strict=True):
             own = (R[:, n:] * members).reshape(k * c, p)
             blocks[:, n:, :, n:] -= (own * (self.weight / np.maximum(count, 1)) @ own.T).reshape(k, c, k, c)
         for i in range(c):
@@ -424,7 +421,7 @@ class Remainder:
         self._add_priors(normal, moment, light, terms, share, total)
         return normal, moment
 
-    def _build_change_matrix(self, terms: Sequence[Term], changes: tuple[int, ...], total: int) -> np.ndarray:
+    def _build_change_matrix(self, terms: Sequence[Term], changes: Indices, total: int) -> np.ndarray:
         """Return the matrix (total, unknowns) that expands the steps of the room light to the values of each frame.
 
         Gains and waves have one unknown per frame.
@@ -449,15 +446,9 @@ class Remainder:
         """Add the priors of the light to the normal equations, in place."""
         model = self.model
         n, u = len(model.phased), len(model.used)
-        now: dict[Term, np.ndarray] = {
-            "gain": np.log(light.gain[model.used])[:, None],
-            "wave": light.wave[model.used],
-            "uniform": light.uniform[model.used, None],
-            "albedo": light.albedo[model.used],
-        }
         known = np.isin(model.used, model.informed)
         relative = np.eye(u) + COMMON * np.outer(known, known)  # the frames' mean is the scene's own
-        columns = [(term, column) for term in terms for column in now[term].T]
+        columns = [(term, column) for term in terms for column in light.values(term, model.used).T]
         for a, (term, column) in enumerate(columns):
             here = slice(a * u, (a + 1) * u)
             precision = (PRIOR[term] * self.scale(term)) ** -2

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any
 
 import cv2
 import numpy as np
@@ -10,7 +11,7 @@ import numpy as np
 from slviewer.fringe import limits
 from slviewer.fringe.layout import white_level
 from slviewer.fringe.residual_sample import estimate_roughness, fit_cosine
-from slviewer.fringe.sequence import PatternSequence
+from slviewer.fringe.sequence import Indices, Kind, PatternSequence
 
 ROWS, COLUMNS = 48, 88
 """Sampled rows and columns: rows enough for eight cycles of flicker, pixels enough to know a gain to 0.1 %."""
@@ -44,9 +45,9 @@ class LightSample:
     frames: np.ndarray
     row: np.ndarray
     column: np.ndarray
-    shifts: tuple[tuple[int, ...], ...]
-    coded: tuple[int, ...]
-    partner: tuple[int, ...]
+    shifts: tuple[Indices, ...]
+    coded: Indices
+    partner: Indices
     interior: np.ndarray
     bright: np.ndarray
     amplitudes: np.ndarray
@@ -76,50 +77,43 @@ def sample_light(
         for size, count in ((height, ROWS // 2 if coarse else ROWS), (width, COLUMNS // 4 if coarse else COLUMNS))
     )
     row, column = (grid.ravel() for grid in np.meshgrid(rows, columns, indexing="ij"))
-    shifts = _list_shifts(sequence)
-    phased = [i for shift in shifts for i in shift]
+    shifts = list_shifts(sequence)
     coded = tuple(i for i, f in enumerate(sequence.frames) if f.kind not in ("phase", "texture"))
-    used = [*phased, *coded]
+    used = [*sum(shifts, ()), *coded]
     frames = np.zeros((len(stack), len(row)), np.float32)
     for i in used:
         frames[i] = stack[i][row, column]
     white = white_level(sequence, stack, used)
     run = columns[0] + np.arange(width - 2 * margin)
-    rough = estimate_roughness(
-        np.stack([stack[i][rows[::4, None], run] for i in used[:4]]).astype(np.float32), len(run)
-    )
+    smooth = np.stack([stack[i][rows[::4, None], run] for i in used[:4]]).astype(np.float32)
+    rough = estimate_roughness(smooth, len(run))
     limit = max(limits.DARK_LEVELS * white / 255, limits.DARK_SIGMAS * rough)
-    if phased:
+    if shifts:
         amplitudes = np.stack([np.abs(fit_cosine(frames[list(shift)])[1]) for shift in shifts])
         pixel_counts = np.count_nonzero(amplitudes > limit, axis=1)
         if pixel_counts.max() < MIN_PIXELS:
             return None
-        shown = np.flatnonzero(
-            pixel_counts > 0.5 * pixel_counts.max()
-        )  # excludes an axis that was not shown, or is out of view
+        # excludes an axis that was not shown, or is out of view
+        shown = np.flatnonzero(pixel_counts > 0.5 * pixel_counts.max())
         amplitudes, shifts = amplitudes[shown], tuple(shifts[s] for s in shown)
-        phased = [i for shift in shifts for i in shift]
-        valid = (amplitudes.min(axis=0) > limit) & (frames[phased].max(axis=0) < white)
+        valid = (amplitudes.min(axis=0) > limit) & (frames[[*sum(shifts, ())]].max(axis=0) < white)
     else:
         amplitudes = estimate_albedo(sequence, frames)[None]
         valid = amplitudes[0] > limit
     if np.count_nonzero(valid) < MIN_PIXELS:  # too few for statistics
         return None
-    row, column, frames = row[valid], column[valid], frames[:, valid]
-    partner = _match_partner_frames(sequence, coded)
-    amplitudes = amplitudes[:, valid]
-    interior, bright = _detect_stripe_interiors(
-        sequence, stack, frames, coded, partner, row, column, gain, DECIDED * amplitudes[-1], phased
-    )
-    if coded:
-        interior &= frames[list(coded)] < white
+    row, column, frames, amplitudes = row[valid], column[valid], frames[:, valid], amplitudes[:, valid]
+    gain = np.ones(len(stack)) if gain is None else gain
+    pixels = _CodedPixels(sequence, stack, coded, _match_partner_frames(sequence, coded), row, column, gain)
+    interior, bright = _detect_stripe_interiors(pixels, frames, sum(shifts, ()), DECIDED * amplitudes[-1])
+    interior &= frames[list(coded)] < white
     return LightSample(
         frames,
         (row / (height - 1)).astype(np.float32),
         (column / (width - 1)).astype(np.float32),
         shifts,
         coded,
-        partner,
+        pixels.partner,
         interior,
         bright,
         amplitudes,
@@ -133,7 +127,7 @@ def estimate_albedo(sequence: PatternSequence, frames: np.ndarray, changes: Sequ
     The modulation of a phase shift between whose frames no light ``changes``, or half the range of the coded frames
     between two changes.
     """
-    shifts = _list_shifts(sequence)
+    shifts = list_shifts(sequence)
     if shifts:
         chosen = np.stack([frames[i] for i in shifts[steady_shift(shifts, changes)]]).astype(np.float32)
         return np.abs(fit_cosine(chosen.reshape(len(chosen), -1))[1]).reshape(frames.shape[1:])
@@ -143,7 +137,7 @@ def estimate_albedo(sequence: PatternSequence, frames: np.ndarray, changes: Sequ
 
 def _compute_half_range(
     frames: np.ndarray, coded: Sequence[int], partner: Sequence[int], changes: Sequence[int]
-) -> np.ndarray:  # fmt: skip
+) -> np.ndarray:
     """Return half the difference, float32 grey levels, of bright and dark among the ``coded`` frames.
 
     This is the largest difference between a bit and its inverse, which see the same room light; without inverses, the
@@ -169,80 +163,106 @@ def steady_shift(shifts: Sequence[Sequence[int]], changes: Sequence[int]) -> int
     )
 
 
-def _list_shifts(sequence: PatternSequence) -> tuple[tuple[int, ...], ...]:
+def list_shifts(sequence: PatternSequence) -> tuple[Indices, ...]:
     """Return the frames of every phase-shifted period, of all axes."""
     return tuple(steps for axis in sequence.axes for _, steps in sequence.phase_shifts(axis))
 
 
-def _match_partner_frames(sequence: PatternSequence, coded: tuple[int, ...]) -> tuple[int, ...]:
+def _match_partner_frames(sequence: PatternSequence, coded: Indices) -> Indices:
     """Return for each coded frame the index in ``coded`` of its inverse, or of the bit that it inverts.
 
     -1 without one.
     """
-    place = {(sequence.frames[i].kind, sequence.frames[i].axis, sequence.frames[i].bit): k for k, i in enumerate(coded)}
+    frames = [sequence.frames[i] for i in coded]
+    place: dict[Any, int] = {(f.kind, f.axis, f.bit): k for k, f in enumerate(frames)}
     other = {"gray": "inverse", "inverse": "gray"}
-    return tuple(
-        place.get((other.get(f.kind, ""), f.axis, f.bit), -1) for f in (sequence.frames[i] for i in coded)  # type: ignore[arg-type]
-    )  # fmt: skip
+    return tuple(place.get((other.get(f.kind), f.axis, f.bit), -1) for f in frames)
+
+
+@dataclass(frozen=True, eq=False)
+class _CodedPixels:
+    """Sampled pixels of the ``coded`` frames (c,) of a stack, at ``row`` and ``column`` (p,), px.
+
+    ``partner`` (c,): see `LightSample`; ``gain`` (n,): of all frames of the stack.
+    """
+
+    sequence: PatternSequence
+    stack: np.ndarray
+    coded: Indices
+    partner: Indices
+    row: np.ndarray
+    column: np.ndarray
+    gain: np.ndarray
+
+    def kind(self, k: int) -> Kind:
+        """Return the kind of a coded frame."""
+        return self.sequence.frames[self.coded[k]].kind
+
+    def is_even(self, k: int) -> bool:
+        """Return whether a coded frame is white or black."""
+        return self.kind(k) in ("white", "black")
+
+    def level(self, k: int, down: int = 0, right: int = 0) -> np.ndarray:
+        """Return the grey levels (p,) float32 of a coded frame over its gain, so many px beside the pixels."""
+        i = self.coded[k]
+        return np.asarray(self.stack[i][self.row + down, self.column + right] / np.float32(self.gain[i]))
+
+    def levels_around(self, k: int) -> np.ndarray:
+        """Return the levels of a coded frame at the pixels and at all distances ``AROUND`` them, (9, p)."""
+        beside = [self.level(k, 0, d) for d in AROUND] + [self.level(k, d) for d in AROUND]
+        return np.stack([self.level(k), *beside])
 
 
 def _detect_stripe_interiors(
-    sequence: PatternSequence,
-    stack: np.ndarray,
-    frames: np.ndarray,
-    coded: tuple[int, ...],
-    partner: tuple[int, ...],
-    row: np.ndarray,
-    column: np.ndarray,
-    gain: np.ndarray | None,
-    least: np.ndarray,
-    phased: list[int],
+    pixels: _CodedPixels, frames: np.ndarray, phased: Sequence[int], least: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return where each coded frame shows the interior of a stripe, and whether it is bright: (c, p) bool each.
 
-    ``gain`` (n,): known gains, 1 if None; ``least`` (p,): grey levels from the threshold that an interior needs;
-    ``phased``: the phase-shifted frames, whose mean is the threshold.
+    ``frames`` (n, p): levels of all frames; ``phased``: the phase-shifted ones, whose mean is the threshold; ``least``
+    (p,): grey levels from the threshold that an interior needs.
     """
-    gain = np.ones(len(stack)) if gain is None else gain
-    ends = [i for i in coded if sequence.frames[i].kind in ("white", "black")]
-    reference = phased or (ends if len(ends) > 1 else list(coded))
-    threshold = np.mean([frames[i] / np.float32(gain[i]) for i in reference], axis=0)
-    alone = [k for k, i in enumerate(coded) if partner[k] < 0 and sequence.frames[i].kind not in ("white", "black")]
-    levels = [frames[coded[k]] / np.float32(gain[coded[k]]) - threshold for k in alone]
-    offsets = dict(
-        zip(alone, _estimate_room_offsets(levels, least / DECIDED) if phased else [0.0] * len(alone), strict=True)
-    )
-    around = [(0, 0), *((0, d) for d in AROUND), *((d, 0) for d in AROUND)]
-    interior, bright = (np.zeros((len(coded), len(row)), bool) for _ in range(2))
-    for k, (i, other) in enumerate(zip(coded, partner, strict=True)):
-        kind = sequence.frames[i].kind
-        if kind in ("white", "black"):
-            interior[k], bright[k] = True, kind == "white"
-            continue
-        if other > -1 and other < k:
+    thresholds = _estimate_thresholds(pixels, frames, phased, least)
+    interior, bright = np.zeros((2, len(pixels.coded), len(least)), bool)
+    for k, other in enumerate(pixels.partner):
+        if pixels.is_even(k):
+            interior[k], bright[k] = True, pixels.kind(k) == "white"
+        elif -1 < other < k:
             interior[k], bright[k] = interior[other], ~bright[other]
-            continue
-        above = np.empty((len(around), len(row)), bool)
-        for m, (down, right) in enumerate(around):
-            level = stack[i][row + down, column + right] / np.float32(gain[i])
-            if other > -1:
-                above[m] = level > stack[coded[other]][row + down, column + right] / np.float32(gain[coded[other]])
-            else:
-                above[m] = level > threshold + offsets[k]
-        middle = frames[coded[other]] / np.float32(gain[coded[other]]) if other > -1 else threshold + offsets[k]
-        decided = np.abs(frames[i] / np.float32(gain[i]) - middle) > least
-        bright[k], interior[k] = above[0], (above == above[0]).all(axis=0) & decided
-    for axis in sequence.axes:
-        own = [k for k, i in enumerate(coded) if sequence.frames[i].axis == axis]
+        else:
+            height = pixels.levels_around(k) - (thresholds[k] if other < 0 else pixels.levels_around(other))
+            above = height > 0
+            bright[k], interior[k] = above[0], (above == above[0]).all(axis=0) & (np.abs(height[0]) > least)
+    _exclude_blurred_stripes(pixels, interior, bright)
+    return interior, bright
+
+
+def _estimate_thresholds(
+    pixels: _CodedPixels, frames: np.ndarray, phased: Sequence[int], least: np.ndarray
+) -> dict[int, np.ndarray]:
+    """Return the levels (p,) between dark and bright stripes of each bit without a partner."""
+    coded = pixels.coded
+    ends = [i for k, i in enumerate(coded) if pixels.is_even(k)]
+    reference = phased or (ends if len(ends) > 1 else coded)
+    threshold: np.ndarray = np.mean([frames[i] / np.float32(pixels.gain[i]) for i in reference], axis=0)
+    alone = [k for k, other in enumerate(pixels.partner) if other < 0 and not pixels.is_even(k)]
+    if not phased:
+        return dict.fromkeys(alone, threshold)
+    offsets = _estimate_room_offsets([pixels.level(k) - threshold for k in alone], least / DECIDED)
+    return {k: threshold + offset for k, offset in zip(alone, offsets, strict=True)}
+
+
+def _exclude_blurred_stripes(pixels: _CodedPixels, interior: np.ndarray, bright: np.ndarray) -> None:
+    """Set ``interior`` (c, p) False for axes that were not shown, and stripes finer than those without an inside."""
+    frames = [pixels.sequence.frames[i] for i in pixels.coded]
+    for axis in pixels.sequence.axes:
+        own = [k for k, frame in enumerate(frames) if frame.axis == axis]
         if own and not (interior[own] & bright[own]).mean(axis=1).max() > SHOWN:
             interior[own] = False  # the axis was not shown, or is out of view
-        # Stripes finer than those without an inside have none either: they are blurred to one grey.
-        coded_bits = sorted(k for k in own if sequence.frames[coded[k]].kind in ("gray", "inverse"))
-        coded_bits.sort(key=lambda k: sequence.frames[coded[k]].bit)
-        shares = interior[coded_bits].mean(axis=1) if coded_bits else np.zeros(0)
-        if (fine := np.flatnonzero(shares < SHOWN)).size:
-            interior[coded_bits[fine[0] :]] = False
-    return interior, bright
+        # Finer stripes have no inside either: they are blurred to one grey.
+        bits = sorted((k for k in own if frames[k].kind in ("gray", "inverse")), key=lambda k: frames[k].bit)
+        fine = np.flatnonzero(interior[bits].mean(axis=1) < SHOWN)
+        if fine.size:
+            interior[bits[fine[0] :]] = False
 
 
 def _estimate_room_offsets(levels: list[np.ndarray], modulation: np.ndarray) -> list[float]:
@@ -267,7 +287,7 @@ def _estimate_room_offsets(levels: list[np.ndarray], modulation: np.ndarray) -> 
         least = [int(np.argmin(misfit + 1e-3 * np.abs(tried[:, 0]))) for misfit in misfits]
         if (total := sum(float(misfit[k]) for misfit, k in zip(misfits, least, strict=True))) < best:
             best, offsets = total, [float(tried[k, 0]) for k in least]
-    shares = [float(np.mean(level[some] > offset)) for level, offset in zip(levels, offsets, strict=True)]
+    shares = [np.mean(level[some] > offset) for level, offset in zip(levels, offsets, strict=True)]
     return [
         offset if abs(offset) > LEAST_OFFSET * unit and SHOWN < share < 1 - SHOWN else 0.0
         for offset, share in zip(offsets, shares, strict=True)

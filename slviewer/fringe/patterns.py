@@ -6,7 +6,7 @@ from slviewer.errors import InputError
 from slviewer.fringe.sequence import Axis, Frame, PatternSequence
 
 
-def render(sequence: PatternSequence, index: int) -> np.ndarray:
+def render_pattern(sequence: PatternSequence, index: int) -> np.ndarray:
     """Render frame ``index`` as the projector shows it: (height, width) uint8."""
     width, height = sequence.projector
     axis, row = profile(sequence, index)

@@ -19,6 +19,10 @@ GRAY_SIGMA_CELLS = 12**-0.5
 """Standard deviation of a coordinate known only to its Gray cell, 0.29 px where cells are projector columns."""
 
 
+Noise = tuple[float, float]
+"""(a, b): the variance of one frame's grey level is a + b * level."""
+
+
 class Reason(IntEnum):
     """Reason why a pixel has no absolute phase."""
 
@@ -56,7 +60,7 @@ class PhaseMap:
     modulation: np.ndarray
     background: np.ndarray
     reason: np.ndarray
-    noise: tuple[float, float]
+    noise: Noise
     steps: int
     unambiguous_px: float = np.inf
     model_error_rad: float = 0.0

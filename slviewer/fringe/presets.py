@@ -1,17 +1,18 @@
 """Ready-made pattern sequences."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from math import ceil, log2
 
 from slviewer.errors import InputError
-from slviewer.fringe.sequence import Axis, Frame, PatternSequence
+from slviewer.fringe.sequence import Axis, Frame, PatternSequence, Size
 
 AXES: tuple[Axis, ...] = ("x", "y")
 MICRO_PX = (12.0, 16.0)
 """Shortest period of micro phase shifting, and about the longest."""
 
 
-def p18(projector: tuple[int, int]) -> PatternSequence:
+def p18(projector: Size) -> PatternSequence:
     """Return 18 steps at a period of 18 px, seven Gray bits (more if the projector needs them), then white.
 
     X, then y.
@@ -23,17 +24,16 @@ def p18(projector: tuple[int, int]) -> PatternSequence:
     return PatternSequence(projector, tuple(frames))
 
 
-def gray(projector: tuple[int, int]) -> PatternSequence:
+def gray(projector: Size) -> PatternSequence:
     """Return Gray code alone, each bit followed by its inverse; x, then y, white, black (procam-calibration layout)."""
     frames: list[Frame] = []
     for axis, extent in zip(AXES, projector, strict=True):
-        bits = bits_for(extent)
-        for bit in range(bits):
-            frames += [Frame("gray", axis, bit=bit, bits=bits), Frame("inverse", axis, bit=bit, bits=bits)]
+        for bit in gray_bits(axis, bits_for(extent)):
+            frames += [bit, replace(bit, kind="inverse")]
     return PatternSequence(projector, (*frames, Frame("white"), Frame("black")))
 
 
-def complementary(projector: tuple[int, int], steps: int = 8, period_px: float = 16.0) -> PatternSequence:
+def complementary(projector: Size, steps: int = 8, period_px: float = 16.0) -> PatternSequence:
     """Return phase steps, Gray bits of the fringe order and the complementary bit; x, then y, then white."""
     frames: list[Frame] = []
     for axis, extent in zip(AXES, projector, strict=True):
@@ -42,9 +42,7 @@ def complementary(projector: tuple[int, int], steps: int = 8, period_px: float =
     return PatternSequence(projector, (*frames, Frame("texture")))
 
 
-def multifrequency(
-    projector: tuple[int, int], steps: int = 6, periods_px: Sequence[float] | None = None
-) -> PatternSequence:
+def multifrequency(projector: Size, steps: int = 6, periods_px: Sequence[float] | None = None) -> PatternSequence:
     """Return phase steps at several periods, longest first; x, then y, then white.
 
     ``periods_px`` defaults to 16 px, and as many periods eight times as long each as it takes to cover the axis.
@@ -59,8 +57,8 @@ def multifrequency(
     return PatternSequence(projector, (*frames, Frame("texture")))
 
 
-def micro(projector: tuple[int, int]) -> PatternSequence:
-    """Return phase steps at four periods from 12 to at most 17 px, for surfaces that light themselves; x, y, white.
+def micro(projector: Size) -> PatternSequence:
+    """Return phase steps at four periods from 12 to at most 17 px, for surfaces with interreflections; x, y, white.
 
     Micro phase shifting (Gupta and Nayar, "Micro phase shifting", CVPR 2012): light that reaches a point by way of
     other surfaces, or through the material, averages over such narrow stripes and shifts no phase. There is no long
@@ -79,7 +77,7 @@ def micro(projector: tuple[int, int]) -> PatternSequence:
     return PatternSequence(projector, (*frames, Frame("texture")))
 
 
-def short(projector: tuple[int, int], axis: Axis) -> PatternSequence:
+def short(projector: Size, axis: Axis) -> PatternSequence:
     """Return 11 frames of one axis, for live scanning: 3 + 3 + 4 phase steps of three periods, then white.
 
     Three steps each of a period longer than the axis and of an intermediate one, four of the finest, 16 px. The ratios
@@ -88,15 +86,11 @@ def short(projector: tuple[int, int], axis: Axis) -> PatternSequence:
     """
     finest, longest = 16.0, 1.1 * projector[AXES.index(axis)]
     between = (finest * longest) ** 0.5
-    frames = [
-        frame
-        for period, steps in ((longest, 3), (between, 3), (finest, 4))
-        for frame in phase_steps(axis, steps, period)
-    ]
+    frames = phase_steps(axis, 3, longest) + phase_steps(axis, 3, between) + phase_steps(axis, 4, finest)
     return PatternSequence(projector, (*frames, Frame("texture")))
 
 
-PRESETS: dict[str, Callable[[tuple[int, int]], PatternSequence]] = {
+PRESETS: dict[str, Callable[[Size], PatternSequence]] = {
     "p18": p18,
     "gray": gray,
     "complementary": complementary,
@@ -120,12 +114,12 @@ def bits_for(cells: float) -> int:
     return max(1, ceil(log2(max(1, ceil(cells)))))
 
 
-def covering_periods(extent: int, finest: float = 16.0, ratio: float = 8.0) -> list[float]:
-    """Return periods px from the finest up to one that covers the axis.
+def covering_periods(extent: int) -> list[float]:
+    """Return periods px from 16 px up to one that covers the axis, each eight times as long as the one before.
 
-    The last is a tenth longer than the axis so that its ends cannot be confused. ``ratio``: of successive periods.
+    The last is a tenth longer than the axis so that its ends cannot be confused.
     """
-    periods = [finest]
-    while periods[-1] * ratio < extent:
-        periods.append(periods[-1] * ratio)
+    periods = [16.0]
+    while periods[-1] * 8 < extent:
+        periods.append(periods[-1] * 8)
     return [*periods, 1.1 * extent] if extent > periods[-1] else periods

@@ -4,9 +4,9 @@ import numpy as np
 
 from slviewer.fringe import limits
 from slviewer.fringe.aliased_harmonics import correct_harmonics, estimate_aliased_harmonics
-from slviewer.fringe.frame_light import CLIPPED, equalize_axis, restore_levels
+from slviewer.fringe.decoding_task import DecodingTask, prepare_decoding
 from slviewer.fringe.indirect_light import mask_indirect_light
-from slviewer.fringe.layout import Layout, axis_layout, check_stack, white_level
+from slviewer.fringe.layout import Layout
 from slviewer.fringe.levels import (
     cell_misfit,
     code_cell_px,
@@ -16,11 +16,10 @@ from slviewer.fringe.levels import (
     unambiguous_px,
     unwrap_levels,
 )
-from slviewer.fringe.noise import measure_noise
-from slviewer.fringe.phase import PhaseMap, Reason
+from slviewer.fringe.phase import Noise, PhaseMap, Reason
 from slviewer.fringe.reference_spikes import repair_spikes
 from slviewer.fringe.scatter import with_scatter
-from slviewer.fringe.sequence import Axis, PatternSequence
+from slviewer.fringe.sequence import Axis, Indices, PatternSequence
 from slviewer.fringe.threshold import fringe_mean
 
 TWO_PI = 2 * np.pi
@@ -28,14 +27,8 @@ TWO_PI = 2 * np.pi
 
 def decode_reference(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -> PhaseMap:
     """Decode one axis without kernels, like `decode.decode`: same wrapped phase to 1e-5 rad, absolute to 1e-4 rad."""
-    check_stack(sequence, stack)
-    layout = axis_layout(sequence, axis)
-    full = white_level(sequence, stack, sequence.select(axis))
-    sequence, stack, factor = equalize_axis(sequence, stack, axis)
-    if factor != 1:
-        layout = axis_layout(sequence, axis)
-    white = full if factor == 1 else CLIPPED
-    noise = measure_noise(layout, stack, white)
+    task = prepare_decoding(sequence, stack, axis)
+    layout, stack, noise, white = task.layout, task.stack, task.noise, task.white
     if not layout.shifts:
         phase, modulation, background, inconsistent, dark = _decode_gray_alone(layout, stack, noise)
         wrapped = np.full_like(phase, np.nan)
@@ -52,39 +45,30 @@ def decode_reference(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -
             order, inconsistent = _unwrap_by_levels(layout, [psi for psi, _, _, _ in shifted], cell)
         phase = (wrapped + TWO_PI * order).astype(np.float32)
         dark = np.zeros(phase.shape, bool)
-    dark |= weakest < dark_limit(background, noise, full * factor, dark_sigmas(layout))
+    dark |= weakest < dark_limit(background, noise, task.full_scale, dark_sigmas(layout))
     reason = np.select(
         [saturated, dark, inconsistent], [Reason.SATURATED, Reason.DARK, Reason.INCONSISTENT], Reason.VALID
     ).astype(np.uint8)
     phase[reason != Reason.VALID] = np.nan
     phase, reason = repair_spikes(layout, phase, reason)
-    return complete_map(sequence, layout, stack, white, (phase, wrapped, modulation, background, reason), noise, factor)
+    return complete_map(task, (phase, wrapped, modulation, background, reason))
 
 
-def complete_map(
-    sequence: PatternSequence,
-    layout: Layout,
-    stack: np.ndarray,
-    white: float,
-    maps: tuple[np.ndarray, ...],
-    noise: tuple[float, float],
-    factor: float,
-    mask_indirect: bool = True,
-) -> PhaseMap:
+def complete_map(task: DecodingTask, maps: tuple[np.ndarray, ...], mask_indirect: bool = True) -> PhaseMap:
     """Return the phase map of decoded ``maps`` (phase, wrapped phase, modulation, background, reason), each (h, w).
 
     With ``mask_indirect`` pixels of much indirect light are masked, see `indirect_light`. The phase is corrected
-    for gamma, grey levels are divided by the ``factor`` of equalisation, and the scatter of the phase is measured.
-    ``white`` and ``noise`` are those of the ``stack`` that was decoded.
+    for gamma, grey levels are those of the capture, and the scatter of the phase is measured.
     """
+    layout, factor, (a, b) = task.layout, task.factor, task.noise
     if mask_indirect:
-        mask_indirect_light(sequence, layout, stack, white, maps, noise)
+        mask_indirect_light(task, maps)
     phase, wrapped, modulation, background, reason = maps
-    harmonics = estimate_aliased_harmonics(layout, stack, white, noise)
+    harmonics = estimate_aliased_harmonics(layout, task.stack, task.white, task.noise)
     phase, wrapped = correct_harmonics(harmonics, layout, phase, wrapped)
     if factor != 1:
-        modulation, background, noise = restore_levels(modulation, background, noise, factor)
-    unambiguous = unambiguous_px(layout)
+        per_level = np.float32(1 / factor)
+        modulation, background = modulation * per_level, background * per_level
     phase_map = PhaseMap(
         layout.axis,
         layout.period_px,
@@ -93,16 +77,16 @@ def complete_map(
         modulation,
         background,
         reason,
-        noise,
+        (a / factor**2, b / factor),
         layout.steps,
-        unambiguous,
+        unambiguous_px(layout),
         harmonics.error_rad,
     )
     return with_scatter(phase_map)
 
 
 def phase_shift(
-    stack: np.ndarray, indices: tuple[int, ...], sign: int, offset_rad: float = 0.0
+    stack: np.ndarray, indices: Indices, sign: int, offset_rad: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return wrapped phase (rad), modulation, background and largest sample of one period, float32 (h, w) each.
 
@@ -135,7 +119,7 @@ def dark_sigmas(layout: Layout) -> float:
     return max(limits.DARK_SIGMAS, required_modulation(layout_levels(layout), steps))
 
 
-def dark_limit(background: np.ndarray, noise: tuple[float, float], white: float, sigmas: float) -> np.ndarray:
+def dark_limit(background: np.ndarray, noise: Noise, white: float, sigmas: float) -> np.ndarray:
     """Return the modulation (h, w) float32, grey levels, below which a pixel is DARK."""
     sigma = np.sqrt(np.float32(noise[0]) + np.float32(noise[1]) * background)
     return np.maximum(np.float32(limits.DARK_LEVELS * white / 255), np.float32(sigmas) * sigma)
@@ -179,7 +163,7 @@ def _decode_period_order(
 
 
 def _read_code(
-    layout: Layout, stack: np.ndarray, bits: tuple[int, ...], background: np.ndarray
+    layout: Layout, stack: np.ndarray, bits: Indices, background: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the binary number (h, w) int32 that Gray bits encode, its last digit, and the bits' heights (b, h, w)."""
     heights = np.stack([bit_heights(layout, stack, i, background) for i in bits])
@@ -228,7 +212,7 @@ def _decode_cell(
     return layout.gray_origin_px + code_cell_px(layout) * (code + part), undecided
 
 
-def code_bits(layout: Layout) -> tuple[int, ...]:
+def code_bits(layout: Layout) -> Indices:
     """Return the frames of all Gray bits, the most significant first and the complementary one last."""
     return (*layout.gray, *(() if layout.complementary is None else (layout.complementary,)))
 
@@ -251,7 +235,7 @@ def _unwrap_by_levels(
 
 
 def _decode_gray_alone(
-    layout: Layout, stack: np.ndarray, noise: tuple[float, float]
+    layout: Layout, stack: np.ndarray, noise: Noise
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return phase, modulation, background, inconsistent and dark, (h, w) each, from Gray bits alone.
 

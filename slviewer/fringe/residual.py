@@ -51,13 +51,13 @@ class FrameResidual:
 class FrameResiduals:
     """Residual of each phase-shifted frame of one axis, and the frames of that axis that stand out.
 
-    ``said``: text that reports which frames could not be judged, empty otherwise.
+    ``message``: text that reports which frames could not be judged, empty otherwise.
     """
 
     axis: Axis
     frames: tuple[FrameResidual, ...]
     suspects: tuple[Suspect, ...]
-    said: str = ""
+    message: str = ""
 
 
 def frame_residuals(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -> FrameResiduals:
@@ -77,8 +77,7 @@ def capture_residuals(
 
     ``readings``: of the stack, new ones if None.
     """
-    light = estimate_frame_light(sequence, stack)
-    frames = _Frames(readings or FrameReadings(sequence, stack), light)
+    frames = _Frames(readings or FrameReadings(sequence, stack), estimate_frame_light(sequence, stack))
     residuals = []
     for axis in sequence.axes:
         with suppress(InputError):  # decoding reports it, with the remedy

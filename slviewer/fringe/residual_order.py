@@ -13,6 +13,7 @@ import numpy as np
 
 from slviewer.fringe.ghost import detect_ghosting
 from slviewer.fringe.residual_sample import Fringe, cosine_columns
+from slviewer.fringe.sequence import Indices
 from slviewer.fringe.suspect import Fault, Suspect
 
 _AS_EXPECTED = 0.7
@@ -117,19 +118,13 @@ def detect_strange_frames(sampled: Fringe) -> list[Suspect]:
         if more < 1:
             break
         gain = residual - rest - (freedom - more) * rest / more
-        if gain < max(_STRANGE**2 * products.strength, _STRANGE_NOISE * rest / more):
-            break
-        if _differs_in_light_only(sampled, k):
+        least = max(_STRANGE**2 * products.strength, _STRANGE_NOISE * rest / more)
+        if gain < least or _differs_in_light_only(sampled, k):
             break
         del steps[k]
         i = sampled.shift.indices[k]
-        out.append(
-            Suspect(
-                i,
-                "strange",
-                f"frame {i + 1} does not fit the other steps: something else was shown, or something moved",
-            )
-        )
+        text = f"frame {i + 1} does not fit the other steps: something else was shown, or something moved"
+        out.append(Suspect(i, "strange", text))
     return out
 
 
@@ -177,6 +172,12 @@ class _Products:
         projection, freedom = _compute_residual_projector(tuple(steps.values()), self._n, self._own)
         return float((projection * self._products[rows[:, None], rows]).sum()), freedom
 
+    def judge(self, accepted: dict[int, int], n: int) -> list[tuple[_Hypothesis, float, int]]:
+        """Return each further hypothesis besides ``accepted`` of n steps that can fail, with its `compute_residual`."""
+        hypotheses = _list_hypotheses(accepted, self.places, n)
+        judged = [(hypothesis, *self.compute_residual(hypothesis.steps)) for hypothesis in hypotheses]
+        return [each for each in judged if each[2] >= 1]
+
     def predict_residual(self, before: dict[int, int], after: dict[int, int]) -> float:
         """Return the residual that the fringe alone has under ``before`` if ``after`` is true, in squared grey levels.
 
@@ -193,7 +194,7 @@ class _Products:
 
 
 @lru_cache(4096)
-def _compute_residual_projector(steps: tuple[int, ...], n: int, own: int) -> tuple[np.ndarray, int]:
+def _compute_residual_projector(steps: Indices, n: int, own: int) -> tuple[np.ndarray, int]:
     """Return the (k, k) matrix that projects frames of these k steps onto their residual, and its degrees of freedom.
 
     ``n``: steps of the period; ``own``: number of harmonics fitted per pixel.
@@ -213,13 +214,9 @@ def _choose_products(sampled: Fringe, products: _Products) -> _Products:
         return products
     raw = _Products(sampled, sampled.seen)
 
-    def compute_lowest_residual(judge: _Products) -> float:
+    def compute_lowest_residual(products: _Products) -> float:
         """Return the smallest residual, per degree of freedom, of any hypothesis."""
-        residuals = [
-            judge.compute_residual(hypothesis.steps)
-            for hypothesis in _list_hypotheses(nominal, judge.places, sampled.steps)
-        ]
-        return min((rest / more for rest, more in residuals if more >= 1), default=np.inf)
+        return min((rest / more for _, rest, more in products.judge(nominal, sampled.steps)), default=np.inf)
 
     return min((products, raw), key=compute_lowest_residual)
 
@@ -230,11 +227,7 @@ def _choose_hypothesis(products: _Products, accepted: _Hypothesis, n: int) -> li
     least = products.predict_least_residual(accepted.steps, n)
     if residual < _AS_EXPECTED * least:
         return None
-    judged = [
-        (hypothesis, *products.compute_residual(hypothesis.steps))
-        for hypothesis in _list_hypotheses(accepted.steps, products.places, n)
-    ]
-    judged = [each for each in judged if each[2] >= 1]
+    judged = products.judge(accepted.steps, n)
     if not judged:
         return None
     noise = min(rest / more for _, rest, more in judged)
@@ -277,8 +270,12 @@ def _list_hypotheses(accepted: dict[int, int], places: list[int], n: int) -> Ite
     for k in range(n - 1):
         if accepted.get(k) == k and accepted.get(k + 1) == k + 1:
             yield _Hypothesis("swapped", accepted | {k: k + 1, k + 1: k}, k, k + 1)
-    if any(accepted.get(k) != k for k in range(n)):
-        return
+    if all(accepted.get(k) == k for k in range(n)):
+        yield from _list_shifted_frames(places, n)
+
+
+def _list_shifted_frames(places: list[int], n: int) -> Iterator[_Hypothesis]:
+    """Yield the hypotheses of a fault that shifts all frames after it."""
     for k in range(1, n - 1):
         yield _Hypothesis("dropped", {j: j if j < k else j + 1 for j in range(n - 1)}, k)
     after = [place for place in places if place >= n]
@@ -293,26 +290,25 @@ def _list_hypotheses(accepted: dict[int, int], places: list[int], n: int) -> Ite
         yield _Hypothesis("dropped", {j: j + 1 for j in range(-1, n - 1)}, 0)
 
 
-def _report_fault(hypotheses: list[_Hypothesis], indices: tuple[int, ...]) -> Suspect:
+def _report_fault(hypotheses: list[_Hypothesis], indices: Indices) -> Suspect:
     """Return the suspect for hypotheses that explain the frames equally well."""
     texts = list(dict.fromkeys(_describe_hypothesis(hypothesis, indices) for hypothesis in hypotheses))
     return Suspect(indices[hypotheses[0].place], hypotheses[0].fault, ", or ".join(texts))
 
 
-def _describe_hypothesis(hypothesis: _Hypothesis, indices: tuple[int, ...]) -> str:
+def _describe_hypothesis(hypothesis: _Hypothesis, indices: Indices) -> str:
     """Return the sentence that reports a hypothesis to the operator; frames are counted from 1."""
     frame = indices[hypothesis.place] + 1
     other = indices[hypothesis.other] + 1 if hypothesis.other < len(indices) else frame
-    if hypothesis.fault == "late":
-        return f"frame {frame} shows the pattern of frame {other}: it is late or repeated"
-    if hypothesis.fault == "early":
-        return f"frame {frame} shows the pattern of frame {other}: it came too early"
-    if hypothesis.fault == "swapped":
-        return f"frames {frame} and {other} have changed places"
-    if hypothesis.fault == "dropped":
-        return f"frame {frame} is missing, and those that follow came too early"
     images = "one image" if hypothesis.other == 1 else f"{hypothesis.other} images"
-    return f"from frame {frame} on the camera is {images} behind the projector"
+    texts: dict[Fault, str] = {
+        "late": f"frame {frame} shows the pattern of frame {other}: it is late or repeated",
+        "early": f"frame {frame} shows the pattern of frame {other}: it came too early",
+        "swapped": f"frames {frame} and {other} have changed places",
+        "dropped": f"frame {frame} is missing, and those that follow came too early",
+        "lag": f"from frame {frame} on the camera is {images} behind the projector",
+    }
+    return texts[hypothesis.fault]
 
 
 def _detect_repeated_steps(sampled: Fringe, products: _Products) -> list[int]:

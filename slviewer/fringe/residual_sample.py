@@ -7,6 +7,7 @@ import numpy as np
 
 from slviewer.fringe import limits
 from slviewer.fringe.layout import Shift
+from slviewer.fringe.phase import Noise
 
 PIXELS = 60_000
 """Number of sampled pixels: their statistics are accurate to half a percent."""
@@ -16,7 +17,8 @@ BESIDE = 2
 """Number of frames before and after those of a period that are compared with them."""
 HIGHEST = 6
 """The highest harmonic of the fringe that is attributed to gamma."""
-_ONE_SIDED = 0.5
+ONE_SIDED = 0.5
+"""Length of the mean unit phasor from which pixels do not cover all phases of the fringe."""
 _OUTLIER_CLIPS = 0.5  # a frame that alone clips more of the pixels shows something else, and does not count as clipped
 
 
@@ -37,7 +39,7 @@ class Fringe:
     beside: dict[int, np.ndarray]
     phasor: np.ndarray
     own: int
-    noise: tuple[float, float]
+    noise: Noise
     roughness: float
 
     @property
@@ -57,7 +59,7 @@ class Fringe:
     @property
     def turns(self) -> bool:
         """Whether the pixels cover all phases of the fringe; only then can light and phase changes be separated."""
-        return abs(complex(np.mean(self.phasor / np.maximum(np.abs(self.phasor), 1e-6)))) < _ONE_SIDED
+        return measure_concentration(self.phasor) < ONE_SIDED
 
 
 def cosine_columns(steps: np.ndarray, n: int, own: int) -> np.ndarray:
@@ -76,7 +78,7 @@ def select_rows(height: int, width: int, pixels: int = PIXELS) -> np.ndarray:
     return np.unique(np.linspace(0, height - 1, count).round().astype(int))
 
 
-def sample_fringe(stack: np.ndarray, shift: Shift, noise: tuple[float, float], white: float) -> Fringe | None:
+def sample_fringe(stack: np.ndarray, shift: Shift, noise: Noise, white: float) -> Fringe | None:
     """Return the sampled fringes of one period of a stack (n, h, w); None where too few pixels are modulated.
 
     ``noise``: (a, b) of the grey levels; ``white``: level at which the camera clips.
@@ -104,8 +106,7 @@ def sample_fringe(stack: np.ndarray, shift: Shift, noise: tuple[float, float], w
     if n > 3:
         frames = levels - fit_common_harmonics(levels, phasor, own)
         background, phasor = fit_cosine(frames)
-    angle = (2 * np.pi * np.arange(n) / n)[:, None]
-    fitted = background + np.real(phasor * np.exp(1j * angle).astype(np.complex64))
+    fitted = evaluate_cosine(background, phasor, n)
     neighbours = {
         i: stack[i][rows].ravel()[valid].astype(np.float32) for i in _list_adjacent_frames(shift.indices, len(stack))
     }
@@ -134,6 +135,17 @@ def fit_cosine(frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     phasor = np.empty(frames.shape[1], np.complex64)
     phasor.real, phasor.imag = np.einsum("wk,kp->wp", np.stack([wave.real, wave.imag]), frames)
     return frames.mean(axis=0), phasor
+
+
+def evaluate_cosine(background: np.ndarray, phasor: np.ndarray, n: int) -> np.ndarray:
+    """Return the n steps (n, p) float32 of the cosines that `fit_cosine` has fitted."""
+    angle = (2 * np.pi * np.arange(n) / n)[:, None]
+    return np.asarray(background + np.real(phasor * np.exp(1j * angle).astype(np.complex64)))
+
+
+def measure_concentration(phasor: np.ndarray) -> float:
+    """Return the length of the mean unit phasor (p,): 0 for evenly spread phases, 1 for a common one."""
+    return abs(complex(np.mean(phasor / np.maximum(np.abs(phasor), 1e-6))))
 
 
 def fit_common_harmonics(frames: np.ndarray, phasor: np.ndarray, own: int) -> np.ndarray:

@@ -11,6 +11,10 @@ from msgspec import ValidationError, convert
 from slviewer.errors import InputError
 
 Axis = Literal["x", "y"]
+Indices = tuple[int, ...]
+"""Indices of frames in their sequence, or of images in their stack."""
+Size = tuple[int, int]
+"""Width and height, px."""
 T = TypeVar("T")
 Kind = Literal["phase", "gray", "inverse", "complementary", "white", "black", "texture"]
 
@@ -129,7 +133,7 @@ class PatternSequence:
     Raises InputError when steps or bits are missing, repeated, or contradict each other, or a value is out of range.
     """
 
-    projector_size: tuple[int, int] | None
+    projector_size: Size | None
     frames: tuple[Frame, ...]
     phase_sign: int | PerAxis[int] = 1
     gray_origin_px: float | PerAxis[float] = -0.5
@@ -159,7 +163,7 @@ class PatternSequence:
             self._check_bits(axis)
 
     @property
-    def projector(self) -> tuple[int, int]:
+    def projector(self) -> Size:
         """Projector size (width, height) in px. Raises InputError where it is not known."""
         if self.projector_size is None:
             raise InputError(
@@ -189,19 +193,19 @@ class PatternSequence:
 
     def sign(self, axis: Axis) -> int:
         """Return ``phase_sign`` of the axis, 1 or -1."""
-        return _select_axis_value(self.phase_sign, axis)
+        return select_axis_value(self.phase_sign, axis)
 
     def offset_rad(self, axis: Axis) -> float:
         """Return ``phase_offset_rad`` of the axis."""
-        return float(_select_axis_value(self.phase_offset_rad, axis))
+        return float(select_axis_value(self.phase_offset_rad, axis))
 
     def origin_px(self, axis: Axis) -> float:
         """Return ``gray_origin_px`` of the axis."""
-        return _select_axis_value(self.gray_origin_px, axis)
+        return select_axis_value(self.gray_origin_px, axis)
 
     def gray_cell(self, axis: Axis) -> float:
         """Return the width, px, of the cells that the Gray bits of the axis number."""
-        cell = _select_axis_value(self.gray_cell_px, axis)
+        cell = select_axis_value(self.gray_cell_px, axis)
         if cell is not None:
             return float(cell)
         periods = self.periods_px(axis)
@@ -220,7 +224,11 @@ class PatternSequence:
         """Return the indices of the axis' frames of one kind, in order."""
         return [i for i in self.select(axis) if self.frames[i].kind == kind]
 
-    def phase_shifts(self, axis: Axis) -> tuple[tuple[float, tuple[int, ...]], ...]:
+    def bits(self, kind: Kind, axis: Axis) -> Indices:
+        """Return the indices of the axis' frames of one kind, the most significant bit first."""
+        return tuple(sorted(self.find(kind, axis), key=lambda i: self.frames[i].bit))
+
+    def phase_shifts(self, axis: Axis) -> tuple[tuple[float, Indices], ...]:
         """Return (period px, frame indices by step) of each phase shift of the axis, longest period first."""
         steps = sorted(self.find("phase", axis), key=lambda i: self.frames[i].step)
         return tuple(
@@ -236,7 +244,7 @@ class PatternSequence:
                 f"axis {axis}: phase_offset (phase_offset_rad) is {self.offset_rad(axis)} rad and gray_origin "
                 f"(gray_origin_px) {self.origin_px(axis)} px: give finite numbers"
             )
-        cell = _select_axis_value(self.gray_cell_px, axis)
+        cell = select_axis_value(self.gray_cell_px, axis)
         if cell is not None and not (isfinite(cell) and cell > 0):
             raise InputError(f"axis {axis}: a Gray cell of {cell} px does not exist: give its width in projector px")
 
@@ -326,11 +334,11 @@ class PatternSequence:
         )
 
 
-def parse_size(text: Any) -> tuple[int, int]:
+def parse_size(text: Any) -> Size:
     """Parse (width, height) from "912x1140" or [912, 1140]. Raises InputError."""
     parts = text.lower().split("x") if isinstance(text, str) else text
     try:
-        width, height = convert(parts, tuple[int, int], strict=False)
+        width, height = convert(parts, Size, strict=False)
     except ValidationError as error:
         raise InputError(f"'{text}' is no size: write width and height in px like 912x1140") from error
     if not (1 <= width <= MAX_EXTENT and 1 <= height <= MAX_EXTENT):
@@ -338,7 +346,7 @@ def parse_size(text: Any) -> tuple[int, int]:
     return width, height
 
 
-def _select_axis_value(values: Any, axis: Axis) -> Any:
+def select_axis_value(values: Any, axis: Axis) -> Any:
     """Return the value of one axis, from a common value or a pair."""
     return getattr(values, axis) if isinstance(values, PerAxis) else values
 

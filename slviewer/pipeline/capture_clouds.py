@@ -16,7 +16,7 @@ from slviewer.pipeline.models import Model, load_stereo
 from slviewer.pipeline.scale import scale_cloud, scale_factor
 from slviewer.reconstruction.axis_agreement import check_phases, check_sizes
 from slviewer.reconstruction.cloud import Cloud
-from slviewer.reconstruction.reconstruct import reconstruct
+from slviewer.reconstruction.reconstruct import reconstruct_cloud
 from slviewer.reconstruction.relative_phase import resolve_phase
 from slviewer.session.capture import Capture
 from slviewer.session.store import Session
@@ -53,7 +53,7 @@ def capture_cloud(
     check = check_phases(capture.name, phases, calibration, stereo.depth_range_mm, accept_rejected)
     for message in check.warnings:
         warn(message)
-    cloud = scale_cloud(reconstruct(model, phases, axis=axis, texture=texture), scale_factor(store, model.name))
+    cloud = scale_cloud(reconstruct_cloud(model, phases, axis=axis, texture=texture), scale_factor(store, model.name))
     return raise_uncertainty(cloud, check.sigma_factor, check.excess_px, phases)
 
 

@@ -23,7 +23,7 @@ from slviewer.fringe.decode import decode
 from slviewer.fringe.presets import complementary
 from slviewer.fringe.sequence import one_axis
 from slviewer.pipeline.feedback import Progress, ignore_progress
-from slviewer.reconstruction.reconstruct import reconstruct
+from slviewer.reconstruction.reconstruct import reconstruct_cloud
 from slviewer.simulation.assets import asset
 from slviewer.simulation.boards import Pose, blank_board
 from slviewer.simulation.lens import SimulatedLens
@@ -181,7 +181,7 @@ def _simulate_plane(
     plate = blank_board(Pose(np.eye(3), np.array([0.0, 0.0, plan.distance])), (4 * plan.camera_field[0],) * 2)
     sequence = one_axis(complementary(projector.size, light.steps, plan.period_px), "x")
     phase = decode(sequence, Renderer(simulated, plate).capture(sequence), "x")
-    cloud = reconstruct(StereoModel.from_rig(rig), {"x": phase}, "x")
+    cloud = reconstruct_cloud(StereoModel.from_rig(rig), {"x": phase}, "x")
     return float(evaluate_plane(cloud.points, np.isfinite(cloud.points[..., 2])).rms_mm), cut.sigma_rms
 
 

@@ -82,8 +82,8 @@ def _judge_order(bench: RigUnderTest, sequence: PatternSequence, stack: np.ndarr
             "Wait longer between showing and grabbing, or lock the camera to the projector.",
             figures,
         )
-    if residuals.said:
-        return Check("order", "unknown", f"The order could not be proved: {residuals.said}.", "", figures)
+    if residuals.message:
+        return Check("order", "unknown", f"The order could not be proved: {residuals.message}.", "", figures)
     return Check("order", "good", f"All {n} coded frames came in order.", "", figures)
 
 

@@ -84,7 +84,7 @@ def _check_order(sequence: PatternSequence, fits: Sequence[FrameResiduals]) -> C
         findings = "; ".join(dict.fromkeys(s.sentence for s in suspects[:3]))
         remedy = "Capture again with a longer delay between showing and grabbing, or put the files in order."
         return Check("order", "bad", f"Of {n} frames, {findings}.", remedy, figures)
-    unknown = "; ".join(fit.said for fit in fits if fit.said)
+    unknown = "; ".join(fit.message for fit in fits if fit.message)
     if unknown:
         return Check("order", "unknown", f"The order of some frames cannot be checked: {unknown}.", "", figures)
     return Check("order", "good", f"All {n} frames are in order.", "", figures)

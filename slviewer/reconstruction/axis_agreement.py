@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from slviewer.errors import InputError
 from slviewer.fringe.phase import PhaseMap
-from slviewer.fringe.sequence import Axis
+from slviewer.fringe.sequence import Axis, Size
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.rig import StereoRig
 from slviewer.geometry.triangulation import triangulate_pixels
@@ -118,21 +118,21 @@ class CaptureCheck:
     excess_px: NDArray[np.float32] | None = None
 
 
-def check_sizes(name: str, camera: tuple[int, int], projector: tuple[int, int] | None, calibrated: StereoRig) -> None:
+def check_sizes(name: str, camera: Size, projector: Size | None, calibrated: StereoRig) -> None:
     """Raise InputError where a capture's camera or projector has not the size that was calibrated."""
-    wanted = calibrated.camera.size, calibrated.projector.size
-    if tuple(camera) != wanted[0]:
-        raise InputError(
-            f"{name}: the capture was taken with a camera image of {_size(camera)} px, the calibration was made with "
-            f"{_size(wanted[0])}{_scale(camera, wanted[0])}: use captures of the calibrated camera, at the same "
-            "resolution and without cropping, or calibrate at this one"
-        )
-    if projector is not None and tuple(projector) != wanted[1]:
-        raise InputError(
-            f"{name}: the capture was taken with a projector of {_size(projector)} px, the calibration was made with "
-            f"{_size(wanted[1])}{_scale(projector, wanted[1])}: import the capture with the projector's true size, or "
-            "calibrate with patterns of the same size"
-        )
+    use_camera = (
+        "use captures of the calibrated camera, at the same resolution and without cropping, or calibrate at this one"
+    )
+    use_size = "import the capture with the projector's true size, or calibrate with patterns of the same size"
+    for what, size, wanted, remedy in (
+        ("camera image", camera, calibrated.camera.size, use_camera),
+        ("projector", projector, calibrated.projector.size, use_size),
+    ):
+        if size is not None and tuple(size) != wanted:
+            raise InputError(
+                f"{name}: the capture was taken with a {what} of {_size(size)} px, the calibration was made with "
+                f"{_size(wanted)}{_scale(size, wanted)}: {remedy}"
+            )
 
 
 def check_phases(
@@ -172,7 +172,7 @@ def check_phases(
             )
         return CaptureCheck(1.0, (*warnings, *_depth_warning(name, depths, depth_range)))
     pixels, measured, sigma = _samples(phases)
-    agreement = measure_agreement(calibration, pixels, measured, sigma)
+    agreement = measure_axis_agreement(calibration, pixels, measured, sigma)
     if agreement is None:
         return CaptureCheck()
     if agreement.is_refused:
@@ -202,8 +202,8 @@ def local_misfit(
     """Return the misfit of the axes in px of the projector for each of `TILES` of the image, beyond what is predicted
     there; 0 where noise and the calibration's residuals explain it, None where they do so everywhere.
 
-    ``pixels``, ``measured`` and ``sigma`` (n, 2) as `measure_agreement` takes them. What disturbs one axis disturbs the
-    other about as much.
+    ``pixels``, ``measured`` and ``sigma`` (n, 2) as `measure_axis_agreement` takes them. What disturbs one axis
+    disturbs the other about as much.
     """
     rig = calibration.pinholes
     distance, normal = epipolar_distance(rig, *calibration.undistort_pairs(pixels, measured))
@@ -220,7 +220,7 @@ def local_misfit(
     return excess if excess.any() else None
 
 
-def measure_agreement(
+def measure_axis_agreement(
     calibration: Calibration, pixels: np.ndarray, measured: np.ndarray, sigma: np.ndarray
 ) -> AxisAgreement | None:
     """How far camera ``pixels`` (n, 2) and the projector coordinates ``measured`` there (n, 2) px, of noise ``sigma``
@@ -276,12 +276,16 @@ def _compute_agreement(
     )
 
 
+def _sample_pixels(mask: np.ndarray) -> np.ndarray:
+    """Return rows and columns (2, n) of at most `SAMPLE` pixels of a mask (h, w)."""
+    places = np.array(np.nonzero(mask))
+    return places[:, :: max(1, -(-places.shape[1] // SAMPLE))]
+
+
 def _samples(phases: Mapping[Axis, PhaseMap]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Camera pixels (n, 2) that both axes decoded, the coordinates (n, 2) px there, and their errors (n, 2) px
     by noise and by blur at edges."""
-    v, u = np.nonzero(np.logical_and.reduce([phase.mask for phase in phases.values()]))
-    some = slice(None, None, max(1, -(-len(v) // SAMPLE)))
-    v, u = v[some], u[some]
+    v, u = _sample_pixels(np.logical_and.reduce([phase.mask for phase in phases.values()]))
     measured, sigma = np.empty((2, len(v), 2))
     for column, axis in enumerate(("x", "y")):
         phase = phases[axis]  # type: ignore[index]
@@ -293,11 +297,9 @@ def _samples(phases: Mapping[Axis, PhaseMap]) -> tuple[np.ndarray, np.ndarray, n
 def _single_axis(phases: Mapping[Axis, PhaseMap], rig: StereoRig) -> tuple[np.ndarray, float]:
     """Depths (n,) mm of one axis' points, and the share of the decoded pixels that have one."""
     ((axis, phase),) = phases.items()
-    v, u = np.nonzero(phase.mask)
+    v, u = _sample_pixels(phase.mask)
     if len(v) < LEAST_PIXELS:
         return np.empty(0), 1.0
-    some = slice(None, None, max(1, -(-len(v) // SAMPLE)))
-    v, u = v[some], u[some]
     points = triangulate_pixels(rig, np.column_stack([u, v]).astype(float), phase.coordinate[v, u], axis)
     known = np.isfinite(points[:, 2])
     return points[known, 2], float(known.mean())
@@ -325,8 +327,8 @@ def _describe_contradiction(agreement: AxisAgreement) -> str:
             f"the x and y patterns disagree by {agreement.misfit_px:.1f} px with this calibration, and noise explains "
             f"{agreement.predicted_px:.2f} px"
         )
-    return f"by this calibration {100 * (1 - agreement.in_front):.0f} % of the points lie behind the camera "
-    "or the projector"
+    share = f"{100 * (1 - agreement.in_front):.0f} %"
+    return f"by this calibration {share} of the points lie behind the camera or the projector"
 
 
 def _likely_reason(agreement: AxisAgreement, rig: StereoRig, pixels: np.ndarray, measured: np.ndarray) -> str:
@@ -383,12 +385,12 @@ def _hypotheses(
             yield reason, rig, pixels, (measured + 0.5) * factors - 0.5
 
 
-def _size(size: tuple[int, int]) -> str:
+def _size(size: Size) -> str:
     """Format a size (width, height) px as "WxH"."""
     return f"{size[0]}x{size[1]}"
 
 
-def _scale(size: tuple[int, int], calibrated: tuple[int, int]) -> str:
+def _scale(size: Size, calibrated: Size) -> str:
     """Describe the ratio of two sizes where it is a quarter, half, twice or four times; empty otherwise."""
     for factor, words in ((0.5, "half"), (2.0, "twice"), (0.25, "a quarter of"), (4.0, "four times")):
         if size[0] == factor * calibrated[0] and size[1] == factor * calibrated[1]:

@@ -17,7 +17,7 @@ class Cloud:
     ``model``: the calibration's name. ``sigma_z``: (h, w) float32 mm, predicted from the capture's noise.
     ``sigma_calibration``: (h, w) float32 mm of z too, what the calibration leaves uncertain, rigid motion apart: the
     same in every scan; None from a model that does not know. ``sigma_edges``: (h, w) float32 mm, what the camera's blur
-    at edges and light by other paths add, no less lasting; None where nothing does.
+    at edges and light by other paths add, systematic as well; None where nothing does.
     ``texture``: (h, w) grey or (h, w, 3) RGB, uint8, or None; a 16-bit texture is scaled to 8 bits by the camera's
     range (10, 12, 14 or 16 bits, whichever holds its brightest pixel).
     """
@@ -42,10 +42,10 @@ class Cloud:
         object.__setattr__(self, "sigma_z", sigma_z)
         for name in ("sigma_calibration", "sigma_edges"):
             if getattr(self, name) is not None:
-                lasting = np.asarray(getattr(self, name), dtype=np.float32)
-                if lasting.shape != sigma_z.shape:
-                    raise InputError(f"{name} of shape {lasting.shape} does not belong to {sigma_z.shape} pixels.")
-                object.__setattr__(self, name, lasting)
+                systematic = np.asarray(getattr(self, name), dtype=np.float32)
+                if systematic.shape != sigma_z.shape:
+                    raise InputError(f"{name} of shape {systematic.shape} does not belong to {sigma_z.shape} pixels.")
+                object.__setattr__(self, name, systematic)
         if self.texture is not None:
             object.__setattr__(self, "texture", _convert_texture(self.texture, points.shape[:2]))
 
@@ -64,11 +64,11 @@ class Cloud:
     def sigma(self) -> np.ndarray:
         """(h, w) float32 mm: standard deviation of z from the known ones of noise, calibration and edges; NaN where
         invalid."""
-        lasting = self.sigma_lasting
-        return self.sigma_z if lasting is None else np.asarray(np.hypot(self.sigma_z, lasting))
+        systematic = self.sigma_systematic
+        return self.sigma_z if systematic is None else np.asarray(np.hypot(self.sigma_z, systematic))
 
     @property
-    def sigma_lasting(self) -> np.ndarray | None:
+    def sigma_systematic(self) -> np.ndarray | None:
         """(h, w) float32 mm: the part of `sigma` that averaging over exposures does not lessen; None if not known."""
         if self.sigma_calibration is None or self.sigma_edges is None:
             return self.sigma_edges if self.sigma_calibration is None else self.sigma_calibration

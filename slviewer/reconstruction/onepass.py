@@ -1,6 +1,7 @@
 """From frames to a cloud in one pass over them, as fast as memory allows: for live scanning and for many captures."""
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -52,7 +53,7 @@ class PassResult:
     light: LightLevels
 
     def cloud(self) -> Cloud:
-        """The organised cloud; it shares this scan's arrays."""
+        """Return the organised cloud; it shares this scan's arrays."""
         return Cloud(self.points, self.axis, self.model, self.sigma_z, self.texture)
 
 
@@ -167,6 +168,10 @@ class OnePass:
                 f"{width}x{height}: use captures of the same camera, at the same resolution and without cropping."
             )
 
+    def _empty(self, shape: tuple[int, ...], dtype: Any) -> np.ndarray:
+        """Return an uninitialised array."""
+        return np.empty(shape, dtype)
+
     def _begun(
         self, frames: np.ndarray, light: LightLevels | None, out: PassResult | None
     ) -> tuple[np.ndarray, PassResult]:
@@ -181,9 +186,9 @@ class OnePass:
 
     def _allocate(self, dtype: np.dtype, light: LightLevels) -> PassResult:
         """Return a result with uninitialised arrays of the camera's size, the texture of ``dtype``."""
-        phase, sigma_z, modulation = (np.empty(self.shape, np.float32) for _ in range(3))
-        points, reason = np.empty((*self.shape, 3), np.float32), np.empty(self.shape, np.uint8)
-        texture = np.empty(self.shape, dtype)
+        phase, sigma_z, modulation = (self._empty(self.shape, np.float32) for _ in range(3))
+        points, reason = self._empty((*self.shape, 3), np.float32), self._empty(self.shape, np.uint8)
+        texture = self._empty(self.shape, dtype)
         return PassResult(self.axis, self.model.name, points, phase, reason, sigma_z, modulation, texture, light)
 
 

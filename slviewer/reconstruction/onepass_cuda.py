@@ -1,7 +1,7 @@
 """The one pass where there is a CUDA device: `one_pass` decides, and without one it is the processor's."""
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, TypeGuard
+from typing import TYPE_CHECKING, Any, TypeGuard
 
 import numpy as np
 
@@ -55,6 +55,10 @@ class CudaPass(OnePass):
             self._texture, self._ladder = texture_frame(self.sequence), pack_levels(self._layout)
         else:
             super().__init__(sequence, model, axis)
+
+    def _empty(self, shape: tuple[int, ...], dtype: Any) -> np.ndarray:
+        """Return an uninitialised array in page-locked memory, for fast transfers."""
+        return cuda_device.allocate_frames(shape, dtype)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -136,10 +140,3 @@ class CudaPass(OnePass):
             self.axis, self.model.name, points, decoded.phase, decoded.reason, sigma, decoded.modulation,
             texture(self.sequence, frames), light,
         )  # fmt: skip
-
-    def _allocate(self, dtype: np.dtype, light: LightLevels) -> PassResult:
-        """Return a result with uninitialised arrays, in page-locked memory for fast transfers."""
-        phase, sigma_z, modulation = (cuda_device.allocate_frames(self.shape, np.float32) for _ in range(3))
-        points, reason = cuda_device.allocate_frames((*self.shape, 3), np.float32), np.empty(self.shape, np.uint8)
-        grey = cuda_device.allocate_frames(self.shape, dtype)
-        return PassResult(self.axis, self.model.name, points, phase, reason, sigma_z, modulation, grey, light)

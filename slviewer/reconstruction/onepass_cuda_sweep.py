@@ -12,7 +12,20 @@ from typing import Any
 
 import numpy as np
 
-from slviewer.fringe.kernels import DARK, INCONSISTENT, PER_TURN, SATURATED, VALID
+from slviewer.fringe.kernels import (
+    DARK,
+    ENDLESS,
+    HALF,
+    INCONSISTENT,
+    NAN,
+    ONE,
+    PER_TURN,
+    QUARTER,
+    SATURATED,
+    THREE_QUARTERS,
+    VALID,
+    ZERO,
+)
 from slviewer.fringe.kernels_coded import EDGE, FAR_EDGE, UNDECIDED, WEAK, WEAKER
 from slviewer.fringe.layout import Layout
 from slviewer.reconstruction.onepass import Job
@@ -20,8 +33,6 @@ from slviewer.reconstruction.onepass import Job
 cuda: Any = import_module("numba.cuda")  # its own annotations are not those of what a kernel may call
 
 TWO_PI = 2 * math.pi
-ZERO, HALF, ONE, NONE, ENDLESS = (np.float32(number) for number in (0, 0.5, 1, math.nan, math.inf))
-QUARTER, THREE_QUARTERS = np.float32(0.25), np.float32(0.75)
 
 NOISE_A, NOISE_B, DARK_LEVELS, DARK_SIGMAS, WHITE, MEAN = range(6)
 """What a light is, float32: see `fringe.kernels.Scale`, and `threshold` for the mean."""
@@ -61,7 +72,7 @@ def sweep_kernel(job: Job, slots: int, measure: Callable[..., Any], deep: bool) 
                 at = at + stride
             if brightest > highest[0]:  # perhaps an old value; the next line settles it
                 cuda.atomic.max(highest, 0, brightest)
-        x, y, z, sigma = NONE, NONE, NONE, NONE
+        x, y, z, sigma = NAN, NAN, NAN, NAN
         if why == VALID:
             x, y, z, slope = measure(i, absolute, c, extra)
             variance = light[NOISE_A] + light[NOISE_B] * A
@@ -196,7 +207,7 @@ def _compile_coded(layout: Layout, pixels: int) -> Any:
         clipped = peak >= light[WHITE] and light[WHITE] <= A + B
         why = _verdict(B, A, clipped, unclear, light)
         absolute = np.float32(np.float64(psi) + TWO_PI * (np.float64(order) - np.float64(whole)))
-        return absolute if why == VALID else NONE, why, B, A
+        return absolute if why == VALID else NAN, why, B, A
 
     return decode
 
@@ -239,6 +250,6 @@ def _compile_levels(job: Job, pixels: int) -> Any:
             coordinate = position + order * period_of[level]
         why = _verdict(weakest, A, clipped, worst > misfit, light)
         absolute = np.float32(np.float64(psi[count - 1]) + TWO_PI * order)
-        return absolute if why == VALID else NONE, why, B, A
+        return absolute if why == VALID else NAN, why, B, A
 
     return decode

@@ -61,7 +61,7 @@ class HasCalibrationSigma(Protocol):
         """(h, w) float32 mm: standard deviation of the depth of organised points due to the calibration."""
 
 
-def reconstruct(
+def reconstruct_cloud(
     model: Model,
     phases: Mapping[Axis, PhaseMap],
     axis: Axis | None = None,

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from slviewer.errors import InputError
-from slviewer.fringe.patterns import render
+from slviewer.fringe.patterns import render_pattern
 from slviewer.fringe.sequence import Frame, PatternSequence
 from slviewer.session.atomic import commit, replace_file, staged_folder, to_json, write_bytes
 from slviewer.session.reading import expand_user
@@ -45,7 +45,7 @@ def write_pattern_folder(folder: Path, sequence: PatternSequence) -> None:
     names = [f"{index:02d}_{_describe_frame(frame)}.png" for index, frame in enumerate(sequence.frames)]
     with staged_folder(folder, len(names) * 4096) as staged:
         for index, name in enumerate(names):
-            done, data = cv2.imencode(".png", render(sequence, index))
+            done, data = cv2.imencode(".png", render_pattern(sequence, index))
             if not done:
                 raise InputError(f"pattern {name} could not be encoded as PNG: is the projector's size right?")
             write_bytes(staged / name, data.data)

@@ -6,7 +6,6 @@ from itertools import permutations
 
 import numpy as np
 
-from slviewer.geometry.rigid import move_points
 from slviewer.geometry.robust import robust_sigma
 from slviewer.reconstruction.cloud import choose_pixels
 from slviewer.surface.overlap_kernels import measure_heights
@@ -35,9 +34,12 @@ class SurfaceAgreement:
     log_gain: float | None
 
 
-def compare_views(
-    views: Mapping[str, View], progress: Callable[[float], None]
-) -> dict[tuple[str, str], SurfaceAgreement]:
+Views = Mapping[str, View]
+Agreements = Mapping[tuple[str, str], SurfaceAgreement]
+"""Of overlapping scans, by their names."""
+
+
+def compare_views(views: Views, progress: Callable[[float], None]) -> dict[tuple[str, str], SurfaceAgreement]:
     """Compare every ordered pair of scans; pairs that overlap in too few points are missing from the result."""
     agreements: dict[tuple[str, str], SurfaceAgreement] = {}
     pairs = list(permutations(views, 2))
@@ -53,32 +55,27 @@ def _compare_pair(first: View, second: View) -> SurfaceAgreement | None:
     """Compare a subset of the first scan's points with the second scan's surface; None for too small an overlap."""
     mask = first.mask
     subset = slice(None, None, max(1, int(mask.sum()) // _SAMPLES))
-    T = np.linalg.inv(second.T) @ first.T
-    points = np.ascontiguousarray(move_points(T, choose_pixels(first.points, mask)[subset]))
-    normals = np.ascontiguousarray(first.normals[mask][subset] @ T[:3, :3].T)
+    points, normals = first.move_into(second, choose_pixels(first.points, mask)[subset], first.normals[mask][subset])
     spacing = max(first.spacing, second.spacing)
     noise = float(np.median(first.noise[mask][subset])) + float(np.median(second.noise[second.mask]))
     window = max(_WINDOW_SPACINGS * spacing, _WINDOW_SIGMAS * noise)
     heights = np.empty((len(points), 2))
-    measure_heights(
-        points, normals, spacing, window, second.points, second.normals, second.noise, second.lasting, second.inner,
-        second.to_pixel, heights,
-    )  # fmt: skip
+    measure_heights(points, normals, spacing, window, second.grid, heights)
     height, overlaps = heights[:, 0], heights[:, 1] >= 0
     if overlaps.sum() < _LEAST_PLACES:
         return None
     height = height[overlaps]
+    log_gain = None
+    if first.colours is not None and second.colours is not None:
+        there = second.colours.reshape(-1, 3)[heights[overlaps, 1].astype(int)]
+        log_gain = _estimate_log_gain(first.colours[mask][subset][overlaps], there)
     gate = min(max(_GATE_SIGMAS * robust_sigma(height, about=0.0), 3.0 * noise, 0.25 * spacing), window)
     return SurfaceAgreement(
         places=int(overlaps.sum()),
         rms_mm=float(np.sqrt(np.mean(height[np.abs(height) <= gate] ** 2))),
         bias_mm=float(np.median(height)),
         gate_mm=gate,
-        log_gain=None
-        if first.colours is None or second.colours is None
-        else _estimate_log_gain(
-            first.colours[mask][subset][overlaps], second.colours.reshape(-1, 3)[heights[overlaps, 1].astype(int)]
-        ),
+        log_gain=log_gain,
     )
 
 
@@ -94,9 +91,7 @@ def _estimate_log_gain(first: np.ndarray, second: np.ndarray) -> float | None:
     return float(np.median(np.log(second[exposed] / first[exposed])))
 
 
-def colour_gains(
-    views: Mapping[str, View], pairs: Mapping[tuple[str, str], SurfaceAgreement]
-) -> dict[str, float] | None:
+def colour_gains(views: Views, pairs: Agreements) -> dict[str, float] | None:
     """Estimate the factor of each scan's colours that makes overlapping scans agree, least squares of the logarithms.
 
     The mean logarithm is 0. None where a scan has no colours.

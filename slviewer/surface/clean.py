@@ -4,12 +4,11 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from slviewer.geometry.cubes import occupied_cubes
 from slviewer.reconstruction.cloud import Cloud, choose_pixels
+from slviewer.surface.topology import label_connected
 
 STEEPEST = 6.0
 """Largest depth step between neighbours of one surface, over their distance across the viewing direction (80°)."""
@@ -31,7 +30,7 @@ class ExcludedPixels:
     edges: int
     grazing: int
     groups: int
-    far: int = 0
+    far: int
 
     @property
     def total(self) -> int:
@@ -104,9 +103,7 @@ def detect_far_clusters(points: np.ndarray, mask: np.ndarray) -> np.ndarray:
         return far
     cubes, which = occupied_cubes(chosen, FAR_SPACINGS * spacing)
     pairs = cKDTree(cubes).query_pairs(1.8, output_type="ndarray")  # all 26 neighbours
-    adjacent = coo_array((np.ones(len(pairs), bool), tuple(pairs.T)), (len(cubes), len(cubes)))
-    _, cluster = connected_components(adjacent, directed=False)
-    cluster = cluster[which]
+    cluster = label_connected(pairs, len(cubes))[which]
     far[mask] = (np.bincount(cluster) < FAR_SHARE * len(chosen))[cluster]
     return far
 

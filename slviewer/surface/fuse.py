@@ -7,7 +7,8 @@ where it is curved, so that nothing is smoothed beyond one scan's resolution.
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -15,9 +16,9 @@ import numpy as np
 from slviewer.errors import InputError
 from slviewer.geometry.rigid import move_points
 from slviewer.reconstruction.cloud import Cloud, choose_pixels
-from slviewer.surface.agreement import SurfaceAgreement, colour_gains, compare_views
+from slviewer.surface.agreement import Agreements, SurfaceAgreement, Views, colour_gains, compare_views
 from slviewer.surface.clean import viewing_cosines
-from slviewer.surface.overlap_kernels import FIELDS, add_surface, count_votes
+from slviewer.surface.overlap_kernels import FIELDS, add_surface, add_votes
 from slviewer.surface.shapes import PointSet
 from slviewer.surface.view import View, prepare_view
 
@@ -105,9 +106,7 @@ def fuse(
     )
 
 
-def _detect_violations(
-    views: Mapping[str, View], pairs: Mapping[tuple[str, str], SurfaceAgreement], progress: Progress
-) -> dict[str, np.ndarray]:
+def _detect_violations(views: Views, pairs: Agreements, progress: Progress) -> dict[str, np.ndarray]:
     """Detect the points, (h, w) bool by scan, in the free space of more scans than the number that confirm them."""
     witnesses = {name: _select_witnesses(view) for name, view in views.items()}
     violations = {}
@@ -121,7 +120,7 @@ def _detect_violations(
                 T = np.linalg.inv(there.T) @ view.T
                 # along the viewing direction two surfaces may be farther apart than along their normal
                 gate = 2.0 * max(_gate_mm(pairs, name, other, view, there), view.spacing, there.spacing)
-                count_votes(
+                add_votes(
                     move_points(T, points), gate, there.points, witnesses[other], there.to_pixel, confirming,
                     contradicting,
                 )  # fmt: skip
@@ -137,7 +136,7 @@ def _select_witnesses(view: View) -> np.ndarray:
     return np.asarray(inside & (view.inner > MIN_WITNESS_WEIGHT) & facing)
 
 
-def _gate_mm(pairs: Mapping[tuple[str, str], SurfaceAgreement], a: str, b: str, first: View, second: View) -> float:
+def _gate_mm(pairs: Agreements, a: str, b: str, first: View, second: View) -> float:
     """Return the gate of two scans by their agreement, or the larger of their point spacings without one."""
     pair = pairs.get((a, b)) or pairs.get((b, a))
     return pair.gate_mm if pair else max(first.spacing, second.spacing)
@@ -145,8 +144,8 @@ def _gate_mm(pairs: Mapping[tuple[str, str], SurfaceAgreement], a: str, b: str, 
 
 def _fuse_scan(
     name: str,
-    views: Mapping[str, View],
-    pairs: Mapping[tuple[str, str], SurfaceAgreement],
+    views: Views,
+    pairs: Agreements,
     gains: Mapping[str, float] | None,
 ) -> tuple[PointSet, np.ndarray]:
     """Average a scan's points with the other scans' surfaces.
@@ -157,11 +156,11 @@ def _fuse_scan(
     view, order = views[name], list(views)
     mask = view.mask
     points, normals = (choose_pixels(values, mask) for values in (view.points, view.normals))
-    noise, lasting, inner = view.noise[mask], view.lasting[mask], view.inner[mask]
+    noise, systematic, inner = view.noise[mask], view.systematic[mask], view.inner[mask]
     R = view.T[:3, :3]
-    weight = inner / (noise.astype(np.float64) ** 2 + lasting.astype(np.float64) ** 2)
+    weight = inner / (noise.astype(np.float64) ** 2 + systematic.astype(np.float64) ** 2)
     sums = np.zeros((len(points), FIELDS))
-    sums[:, 0], sums[:, 2], sums[:, 3] = weight, (weight * noise) ** 2, weight * lasting
+    sums[:, 0], sums[:, 2], sums[:, 3] = weight, (weight * noise) ** 2, weight * systematic
     sums[:, 4:7] = weight[:, None] * (normals @ R.T)
     own_colours = None
     if gains is not None and view.colours is not None:
@@ -174,25 +173,17 @@ def _fuse_scan(
     for other, there in views.items():
         if (name, other) not in pairs and (other, name) not in pairs:
             continue
-        T = np.linalg.inv(there.T) @ view.T
         overlap = np.zeros((len(points), FIELDS))
         add_surface(
-            np.ascontiguousarray(move_points(T, points)),
-            np.ascontiguousarray(normals @ T[:3, :3].T),
+            *view.move_into(there, points, normals),
             view.quality[mask],
             np.ascontiguousarray(there.T[:3, :3]),
             max(view.spacing, there.spacing),
             _gate_mm(pairs, name, other, view, there),
-            there.points,
-            there.normals,
-            there.noise,
-            there.lasting,
-            there.inner,
-            there.quality,
+            there.grid,
             there.colours if own_colours is not None else np.zeros((0, 0, 3), np.uint8),
             1.0 if gains is None else gains[other],
             order.index(other) < order.index(name),
-            there.to_pixel,
             overlap,
             inferior,
         )
@@ -225,11 +216,8 @@ def _add_pose_error(points: PointSet, covariance: np.ndarray, centre: np.ndarray
 
 def _concatenate(parts: list[PointSet]) -> PointSet:
     """Concatenate point sets; attributes that one of them lacks are None."""
-
-    def join(field: str) -> np.ndarray | None:
-        """Concatenate one attribute."""
-        values = [getattr(part, field) for part in parts]
-        return None if any(value is None for value in values) else np.concatenate(values)
-
-    points = np.concatenate([part.points for part in parts])
-    return PointSet(points, join("normals"), join("colours"), join("sigma_mm"))
+    joined: dict[str, Any] = {}
+    for field in fields(PointSet):
+        values = [getattr(part, field.name) for part in parts]
+        joined[field.name] = None if any(value is None for value in values) else np.concatenate(values)
+    return PointSet(**joined)

@@ -64,6 +64,13 @@ class MeshingPlan:
         if self.smooth < 0:
             raise InputError(f"{self.smooth} rounds of smoothing were asked for: give 0 or more.")
 
+    def largest_hole_mm(self, method: Method, cell_mm: float) -> float:
+        """Return how far across a hole may be to be filled."""
+        if self.fill_holes_mm is not None:
+            return self.fill_holes_mm
+        # Only poisson knows how to go on where there is nothing.
+        return np.inf if self.watertight and method == "poisson" else SMALL_HOLE * cell_mm
+
 
 @dataclass(frozen=True, eq=False)
 class BuiltMesh:
@@ -104,10 +111,12 @@ class BuiltMesh:
         for done, holes in ((self.trimmed, "filled"), (self.filled, "holes")):
             if done is not None and (n := getattr(done, holes)):
                 lines.append(f"{n} hole{'s' * (n > 1)} filled, up to {done.largest_mm:.1f} mm across")
-        if self.trimmed is not None and (n := self.trimmed.flattened):
-            lines.append(f"{n} of them filled flat, because the surface bulged there")
-        if self.trimmed is not None and self.trimmed.imagined:
-            lines.append(f"{100 * self.trimmed.imagined:.1f} % of the surface was not measured: it closes those holes")
+        if self.trimmed is not None:
+            if self.trimmed.flattened:
+                lines.append(f"{self.trimmed.flattened} of them filled flat, because the surface bulged there")
+            if self.trimmed.imagined:
+                share = f"{100 * self.trimmed.imagined:.1f} %"
+                lines.append(f"{share} of the surface was not measured: it closes those holes")
         for what, change in (("smoothing", self.smoothed), ("thinning", self.thinned)):
             if change is not None:
                 lines.append(
@@ -129,50 +138,44 @@ def build_mesh(shape: Cloud | PointSet, plan: MeshingPlan | None = None, progres
     Raises InputError for a plan that does not go with the shape, and SlviewerError where there is no surface, or none
     that can be closed as asked.
     """
-    plan, say = plan or MeshingPlan(), progress or (lambda share, doing: None)
+    plan, report = plan or MeshingPlan(), progress or (lambda share, step: None)
     method = plan.method or ("grid" if isinstance(shape, Cloud) and not plan.watertight else "poisson")
-    if method == "grid" and not isinstance(shape, Cloud):
-        raise InputError("Merged points have no pixels: the method grid takes a single scan; use poisson or volume.")
-    say(0.0, "finding the surface")
+    report(0.0, "finding the surface")
     points = shape if isinstance(shape, PointSet) else fuse({"scan": shape}, {"scan": np.eye(4)}).surface
-    cell = spacing(points)
-    limit = plan.fill_holes_mm
-    if limit is None:  # only poisson knows how to go on where there is nothing
-        limit = np.inf if plan.watertight and method == "poisson" else SMALL_HOLE * cell
-    say(0.1, f"meshing by {method}")
-    cut = None
-    if method == "poisson":
-        mesh = poisson_surface(points, cell)
-        say(0.5, "cutting off what was not measured")
-        mesh, cut = trim_far_patches(mesh, points, cell, limit)
+    cell = measure_spacing(points)
+    limit = plan.largest_hole_mm(method, cell)
+    report(0.1, f"meshing by {method}")
+    trimmed = filled = smoothed = thinned = None
+    if method == "grid":
+        mesh = grid_mesh(shape)
     elif method == "volume":
         mesh = volume_surface(points, cell)
     else:
-        assert isinstance(shape, Cloud)
-        mesh = grid_mesh(shape)
+        mesh = poisson_surface(points, cell)
+        report(0.5, "cutting off what was not measured")
+        mesh, trimmed = trim_far_patches(mesh, points, cell, limit)
     if not len(mesh.faces):
         raise SlviewerError("No surface could be laid through the points: merge scans that overlap more.")
-    say(0.6, "leaving out floating parts")
+    report(0.6, "excluding floating parts")
     mesh, dropped = drop_small_parts(mesh, SMALL_PART * cell**2)
-    filled = smoothed = thinned = None
     if method != "poisson" and limit > 0:
-        say(0.65, "filling holes")
+        report(0.65, "filling holes")
         mesh, filled = fill_holes(mesh, limit)
     if plan.smooth:
-        say(0.7, "smoothing")
+        report(0.7, "smoothing")
         mesh, smoothed = smooth(mesh, plan.smooth)
     if plan.triangles is not None:
-        say(0.8, f"thinning to {plan.triangles} triangles")
+        report(0.8, f"thinning to {plan.triangles} triangles")
         mesh, thinned = decimate(mesh, plan.triangles)
-    say(0.95, "checking")
+    report(0.95, "checking")
     topology = analyse_topology(mesh)
     if plan.watertight:
-        _refuse_if_open(topology, cut, method)
-    say(1.0, "meshed")
-    return BuiltMesh(mesh, method, cell, dropped, cut, filled, smoothed, thinned, topology)
+        _refuse_if_open(topology, trimmed, method)
+    report(1.0, "meshed")
+    return BuiltMesh(mesh, method, cell, dropped, trimmed, filled, smoothed, thinned, topology)
 
 
-def spacing(points: PointSet) -> float:
+def measure_spacing(points: PointSet) -> float:
     """Median distance in mm of a point to its nearest neighbour."""
     if len(points) < 2:
         raise InputError(f"{len(points)} points make no surface.")
@@ -185,34 +188,33 @@ def spacing(points: PointSet) -> float:
     return median_mm
 
 
-def _refuse_if_open(found: Topology, cut: TrimmedPatches | None, method: Method) -> None:
+def _refuse_if_open(topology: Topology, trimmed: TrimmedPatches | None, method: Method) -> None:
     """Raise SlviewerError where the mesh is not watertight, or too much of it is extrapolated."""
-    if not found.watertight:
-        remedy = (
-            "fill larger holes, or scan there" if method == "poisson" else "fill holes of that size, or use poisson"
-        )
-        raise SlviewerError(f"The surface does not close: {found.faults()}; {remedy}.")
-    if cut is not None and cut.imagined > MOST_IMAGINED:
+    if not topology.watertight:
+        remedy = "fill holes of that size, or use poisson"
+        if method == "poisson":
+            remedy = "fill larger holes, or scan there"
+        raise SlviewerError(f"The surface does not close: {topology.faults()}; {remedy}.")
+    if trimmed is not None and trimmed.imagined > MOST_IMAGINED:
         raise SlviewerError(
-            f"{100 * cut.imagined:.0f} % of the closed surface would be imagined, not measured (the largest gap is "
-            f"{cut.largest_mm:.0f} mm across): scan the object from more sides, or do without watertight."
+            f"{100 * trimmed.imagined:.0f} % of the closed surface would be imagined, not measured (the largest gap is "
+            f"{trimmed.largest_mm:.0f} mm across): scan the object from more sides, or do without watertight."
         )
 
 
-def grid_mesh(cloud: Cloud) -> Mesh:
+def grid_mesh(cloud: Cloud | PointSet) -> Mesh:
     """Triangles of an organised cloud in its camera's frame, cut at depth jumps, without flying and stray pixels.
 
-    Vertices carry the pixels' normals, colours and sigmas (along the normal). Raises InputError where no two
-    neighbouring pixels lie on a surface.
+    Vertices carry the pixels' normals, colours and sigmas (along the normal). Raises InputError for merged points, and
+    where no two neighbouring pixels lie on a surface.
     """
+    if not isinstance(cloud, Cloud):
+        raise InputError("Merged points have no pixels: the method grid takes a single scan; use poisson or volume.")
     normals = grid_normals(cloud.points)
     cleaned, _ = clean(cloud, normals)
     points = np.where(cleaned[..., None], cloud.points, np.float32(np.nan))
-    faces = (
-        triangulate_grid(points, JUMP * float(np.median(points[..., 2][cleaned])))
-        if cleaned.any()
-        else np.zeros((0, 3))
-    )
+    depth = float(np.median(points[..., 2][cleaned])) if cleaned.any() else np.inf
+    faces = triangulate_grid(points, JUMP * depth)
     if not len(faces):
         raise InputError("No two neighbouring pixels of this scan lie on a surface: reconstruct it again.")
     along = viewing_cosines(points, normals) * np.linalg.norm(points, axis=-1) / points[..., 2]

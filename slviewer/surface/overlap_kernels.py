@@ -1,5 +1,7 @@
 """Compiled loops over the points of one scan that compare them with the surface of another."""
 
+from typing import NamedTuple
+
 import numba
 import numpy as np
 
@@ -8,8 +10,20 @@ from slviewer.geometry.jit import kernel
 MIN_NORMAL_COSINE = 0.5
 """Least cosine between the normals of one surface."""
 FIELDS = 12
-"""Number of sums per point: weight, weight x height, (weight x noise)^2, weight x lasting, weight x normal (3), number
-of scans, weight of colour, weight x colour (3)."""
+"""Number of sums per point: weight, weight x height, (weight x noise)^2, weight x systematic, weight x normal (3),
+number of scans, weight of colour, weight x colour (3)."""
+
+
+class SurfaceGrid(NamedTuple):
+    """Images (h, w, ...) of a scan's surface, and its ``to_pixel``: see `view.View`."""
+
+    points: np.ndarray
+    normals: np.ndarray
+    noise: np.ndarray
+    systematic: np.ndarray
+    inner: np.ndarray
+    quality: np.ndarray
+    to_pixel: np.ndarray
 
 
 @kernel()
@@ -39,16 +53,17 @@ def pixel_of(x, y, z, to_pixel):
 
 
 @kernel()
-def interpolate_surface(p, n, reach, gate, points, normals, noise, lasting, inner, to_pixel, mean):
+def interpolate_surface(p, n, reach, gate, grid, mean):
     """Interpolate a scan's surface at a point ``p`` (3,) mm with normal ``n`` in its frame; False where it has none.
 
-    Fills ``mean`` (8,): height above p along n, its variance, lasting sigma, border weight, normal (3), and the pixel
-    (v * width + u). The height is a weighted mean over the tangent planes of pixels within ``reach`` mm across n and
-    ``gate`` mm along n. Where these planes differ by more than their noise, the surface is curved: the variance
+    Fills ``mean`` (8,): height above p along n, its variance, systematic sigma, border weight, normal (3), and the
+    pixel (v * width + u). The height is a weighted mean over the tangent planes of pixels within ``reach`` mm across n
+    and ``gate`` mm along n. Where these planes differ by more than their noise, the surface is curved: the variance
     increases by what exceeds twice that of the noise.
     """
+    points, normals, noise = grid.points, grid.normals, grid.noise
     height, width = noise.shape
-    u, v = pixel_of(p[0], p[1], p[2], to_pixel)
+    u, v = pixel_of(p[0], p[1], p[2], grid.to_pixel)
     if not (u > -0.5 and v > -0.5 and u < width - 0.5 and v < height - 0.5):
         return False
     row, column = int(np.rint(v)), int(np.rint(u))
@@ -75,8 +90,8 @@ def interpolate_surface(p, n, reach, gate, points, normals, noise, lasting, inne
             variance = noise[y, x] * noise[y, x]
             noises += near * variance
             squares += near * near * variance
-            s += near * lasting[y, x]
-            w += near * inner[y, x]
+            s += near * grid.systematic[y, x]
+            w += near * grid.inner[y, x]
             m0, m1, m2 = m0 + near * q0, m1 + near * q1, m2 + near * q2
     if not total > 0.3:  # a single pixel at the rim of the reach is not enough
         return False
@@ -90,7 +105,7 @@ def interpolate_surface(p, n, reach, gate, points, normals, noise, lasting, inne
 
 
 @kernel(parallel=True)
-def measure_heights(p, n, reach, gate, points, normals, noise, lasting, inner, to_pixel, heights):
+def measure_heights(p, n, reach, gate, grid, heights):
     """Measure the heights of a scan's surface above points ``p`` (k, 3) mm with normals ``n`` (k, 3) in its frame.
 
     Fills ``heights`` (k, 2): the height in mm and the index of the pixel; (NaN, -1) without overlap.
@@ -98,12 +113,12 @@ def measure_heights(p, n, reach, gate, points, normals, noise, lasting, inner, t
     for i in numba.prange(len(p)):
         mean = np.empty(8)
         heights[i, 0], heights[i, 1] = np.nan, -1.0
-        if interpolate_surface(p[i], n[i], reach, gate, points, normals, noise, lasting, inner, to_pixel, mean):
+        if interpolate_surface(p[i], n[i], reach, gate, grid, mean):
             heights[i, 0], heights[i, 1] = mean[0], mean[7]
 
 
 @kernel(parallel=True)
-def count_votes(p, gate, points, witnesses, to_pixel, confirming, contradicting):
+def add_votes(p, gate, points, witnesses, to_pixel, confirming, contradicting):
     """Add a scan's votes on points ``p`` (k, 3) mm in its frame; only its pixels ``witnesses`` (h, w) bool vote.
 
     Adds 1 to ``confirming`` (k,) where its surface is within ``gate`` mm in depth, or to ``contradicting`` (k,) where
@@ -125,35 +140,16 @@ def count_votes(p, gate, points, witnesses, to_pixel, confirming, contradicting)
 
 
 @kernel(parallel=True)
-def add_surface(
-    p,
-    n,
-    own,
-    R,
-    reach,
-    gate,
-    points,
-    normals,
-    noise,
-    lasting,
-    inner,
-    quality,
-    colours,
-    gain,
-    earlier,
-    to_pixel,
-    sums,
-    inferior,
-):
+def add_surface(p, n, own, R, reach, gate, grid, colours, gain, earlier, sums, inferior):
     """Add a scan's surface to the ``sums`` (k, FIELDS) of points ``p`` (k, 3) with normals ``n`` (k, 3) in its frame.
 
     ``R`` (3, 3): rotation from its frame to the reference's. ``inferior`` (k,) is set True where the scan's quality
     exceeds the points' ``own`` (k,), or equals it if the scan is the ``earlier`` one.
     """
-    width = noise.shape[1]
+    height, width = grid.noise.shape
     for i in numba.prange(len(p)):
         mean = np.empty(8)
-        if not interpolate_surface(p[i], n[i], reach, gate, points, normals, noise, lasting, inner, to_pixel, mean):
+        if not interpolate_surface(p[i], n[i], reach, gate, grid, mean):
             continue
         y, x = int(mean[7]) // width, int(mean[7]) % width
         weight = mean[3] / (mean[1] + mean[2] * mean[2])
@@ -164,13 +160,13 @@ def add_surface(
         for k in range(3):
             sums[i, 4 + k] += weight * (R[k, 0] * mean[4] + R[k, 1] * mean[5] + R[k, 2] * mean[6])
         sums[i, 7] += 1.0
-        if colours.shape[0] == noise.shape[0]:
+        if len(colours) == height:
             sight = -(p[i, 0] * n[i, 0] + p[i, 1] * n[i, 1] + p[i, 2] * n[i, 2])
             sight /= np.sqrt(p[i, 0] ** 2 + p[i, 1] ** 2 + p[i, 2] ** 2)
             share = mean[3] * max(sight, 0.0)
             sums[i, 8] += share
             for k in range(3):
                 sums[i, 9 + k] += share * gain * colours[y, x, k]
-        rival = quality[y, x]
+        rival = grid.quality[y, x]
         if rival > own[i] or (rival == own[i] and earlier):
             inferior[i] = True

@@ -10,12 +10,11 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from slviewer.errors import InputError
 from slviewer.geometry.ransac import ransac_plane
 from slviewer.reconstruction.reconstruct import JUMP
+from slviewer.surface.topology import label_connected
 
 PLANE_SHARE = 0.1
 """Of the points that must lie on a plane for it to be taken as what supports the object."""
@@ -97,7 +96,7 @@ def select_connected(points: np.ndarray, seed: tuple[int, int], candidates: Mask
     if not (0 <= u < w and 0 <= v < h and valid[v, u]):
         raise InputError(f"no point was measured at pixel ({u}, {v}): pick one on the surface")
     index = np.arange(h * w).reshape(h, w)
-    ends: list[tuple[np.ndarray, np.ndarray]] = []
+    pairs = []
     for down, right in _STEPS:
         a = (slice(0, h - down), slice(max(0, -right), w - max(0, right)))
         b = (slice(down, h), slice(max(0, right), w + min(0, right)))
@@ -105,10 +104,8 @@ def select_connected(points: np.ndarray, seed: tuple[int, int], candidates: Mask
             depth = np.minimum(points[a][..., 2], points[b][..., 2])
             near = np.linalg.norm(points[a] - points[b], axis=-1) < JUMP * depth
         joined = near & valid[a] & valid[b]
-        ends.append((index[a][joined], index[b][joined]))
-    rows, columns = (np.concatenate(each) for each in zip(*ends, strict=True))
-    graph = coo_array((np.ones(len(rows), bool), (rows, columns)), shape=(h * w, h * w))
-    labels = connected_components(graph, directed=False)[1].reshape(h, w)
+        pairs.append(np.stack([index[a][joined], index[b][joined]], axis=1))
+    labels = label_connected(np.concatenate(pairs), h * w).reshape(h, w)
     return np.asarray(valid & (labels == labels[v, u]))
 
 

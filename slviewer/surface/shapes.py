@@ -1,6 +1,7 @@
 """Unorganised point sets and triangle meshes."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -48,6 +49,12 @@ class Mesh:
         if len(self.faces) and not (self.faces.min() >= 0 and self.faces.max() < len(self.vertices)):
             raise InputError(f"Faces name vertices outside the {len(self.vertices)} that there are.")
         _set_attributes(self, len(self.vertices))
+
+
+def pick_attributes(shape: PointSet | Mesh, which: np.ndarray) -> dict[str, Any]:
+    """Return normals, colours and sigmas of some of the points, by index or mask; None where they are not known."""
+    values = {name: getattr(shape, name) for name in ("normals", "colours", "sigma_mm")}
+    return {name: None if value is None else value[which] for name, value in values.items()}
 
 
 def _set_attributes(shape: "PointSet | Mesh", n: int) -> None:

@@ -19,8 +19,9 @@ from slviewer.geometry.polynomial import monomials
 from slviewer.geometry.rigid import move_points
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.registration.open3d_loader import open3d
-from slviewer.surface.agreement import colour_gains, compare_views
-from slviewer.surface.shapes import Mesh
+from slviewer.surface.agreement import Views, colour_gains, compare_views
+from slviewer.surface.shapes import Mesh, pick_attributes
+from slviewer.surface.topology import face_areas, half_edges
 from slviewer.surface.view import View, prepare_view
 
 SIZES_PX = (512, 8192)
@@ -106,22 +107,14 @@ def texture_mesh(
     image *= 250.0 / max(float(np.percentile(image[seen], 99.5)), 1e-6)
     report(0.95)
     vertices, faces, uv, kept = _split_vertices(mesh, corners)
-    sides = mesh.vertices[mesh.faces].astype(np.float64)
-    area = np.linalg.norm(np.cross(sides[:, 1] - sides[:, 0], sides[:, 2] - sides[:, 0]), axis=1).sum() / 2
-    split = Mesh(
-        vertices,
-        faces,
-        None if mesh.normals is None else mesh.normals[kept],
-        None,
-        None if mesh.sigma_mm is None else mesh.sigma_mm[kept],
-    )
+    split = Mesh(vertices, faces, **(pick_attributes(mesh, kept) | {"colours": None}))
     report(1.0)
     return TexturedMesh(
         split,
         uv,
         np.clip(image + 0.5, 0, 255).astype(np.uint8),
         share,
-        float(np.sqrt(area / np.count_nonzero(chart))),
+        float(np.sqrt(face_areas(mesh).sum() / np.count_nonzero(chart))),
         charts,
         _seam_share(mesh.faces, faces),
     )
@@ -155,7 +148,7 @@ def _bake_places(unfolded: Any, size: int) -> tuple[np.ndarray, np.ndarray]:
 def _blend(
     places: np.ndarray,
     normals: np.ndarray,
-    views: Mapping[str, View],
+    views: Views,
     gains: Mapping[str, float] | None,
     light: np.ndarray | None,
     report: Callable[[float], None],
@@ -180,18 +173,17 @@ def _look(
     points = move_points(np.linalg.inv(view.T), places.astype(np.float64))
     facing = normals @ view.T[:3, :3]
     cosine = -np.sum(facing * points, axis=1) / np.linalg.norm(points, axis=1)
-    rays = points[:, :2] / points[:, 2:]
-    A = monomials((rays - view.to_pixel[:2]) / view.to_pixel[2:4], _DEGREE)
+    rays = (points[:, :2] / points[:, 2:] - view.to_pixel[:2]) / view.to_pixel[2:4]
+    A = monomials(rays, _DEGREE)
     pixels = (A @ view.to_pixel[4:].reshape(2, -1).T).astype(np.float32)
 
     def sample(image: np.ndarray, how: int = cv2.INTER_LINEAR) -> np.ndarray:
         """Return an image at the pixels, NaN outside."""
         outside = (np.nan,) * 4
-        found = cv2.remap(image, pixels[:, :1], pixels[:, 1:], how, borderValue=outside)
-        return np.asarray(found)[:, 0]
+        return np.asarray(cv2.remap(image, pixels[:, :1], pixels[:, 1:], how, borderValue=outside))[:, 0]
 
     away = np.sum((points - sample(view.points, cv2.INTER_NEAREST)) * facing, axis=1)
-    inside = (np.abs((rays - view.to_pixel[:2]) / view.to_pixel[2:4]) <= 1.05).all(axis=1)
+    inside = (np.abs(rays) <= 1.05).all(axis=1)
     with np.errstate(invalid="ignore"):
         sees = inside & (cosine > _MIN_COSINE) & (np.abs(away) < _GATE * view.spacing)
     assert view.colours is not None
@@ -222,8 +214,7 @@ def _seam_share(before: np.ndarray, after: np.ndarray) -> float:
 
     def edges(faces: np.ndarray) -> int:
         """Return the number of different edges."""
-        sides = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64), axis=1)
-        return len(np.unique(sides, axis=0))
+        return len(np.unique(np.sort(half_edges(faces), axis=1), axis=0))
 
     whole = edges(before)
     return (edges(after) - whole) / whole

@@ -7,7 +7,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from slviewer.registration.open3d_loader import open3d
-from slviewer.surface.shapes import Mesh, PointSet
+from slviewer.surface.shapes import Mesh, PointSet, pick_attributes
+from slviewer.surface.topology import face_vectors
 
 
 def transfer_attributes(known: Mesh | PointSet, vertices: np.ndarray, faces: np.ndarray) -> Mesh:
@@ -17,12 +18,11 @@ def transfer_attributes(known: Mesh | PointSet, vertices: np.ndarray, faces: np.
     """
     mesh = Mesh(vertices, faces)
     points = known.vertices if isinstance(known, Mesh) else known.points
-    colours = sigma = None
+    attributes: dict[str, Any] = {}
     if len(mesh.vertices) and (known.colours is not None or known.sigma_mm is not None):
         _, nearest = cKDTree(points).query(mesh.vertices)
-        colours = None if known.colours is None else known.colours[nearest]
-        sigma = None if known.sigma_mm is None else known.sigma_mm[nearest]
-    return replace(mesh, colours=colours, sigma_mm=sigma, normals=vertex_normals(mesh))
+        attributes = pick_attributes(known, nearest)
+    return replace(mesh, **(attributes | {"normals": vertex_normals(mesh)}))
 
 
 def select_faces(mesh: Mesh, mask: np.ndarray) -> Mesh:
@@ -31,25 +31,13 @@ def select_faces(mesh: Mesh, mask: np.ndarray) -> Mesh:
     used = np.zeros(len(mesh.vertices), bool)
     used[faces] = True
     number = np.cumsum(used, dtype=np.int32) - 1
-    fields = {name: getattr(mesh, name) for name in ("normals", "colours", "sigma_mm")}
-    return Mesh(
-        mesh.vertices[used],
-        number[faces] if len(faces) else np.zeros((0, 3), np.int32),
-        **{name: None if value is None else value[used] for name, value in fields.items()},
-    )
+    return Mesh(mesh.vertices[used], number[faces].reshape(-1, 3), **pick_attributes(mesh, used))
 
 
 def vertex_normals(mesh: Mesh) -> np.ndarray:
     """Return the area-weighted mean normals (n, 3) float32 of the faces around each vertex; (0, 0, 1) without faces."""
-    a, b, c = (mesh.vertices[mesh.faces[:, k]].astype(np.float64) for k in range(3))
-    flat = np.cross(b - a, c - a)
-    normals = np.stack(
-        [
-            np.bincount(mesh.faces.ravel(), weights=np.repeat(flat[:, k], 3), minlength=len(mesh.vertices))
-            for k in range(3)
-        ],
-        axis=1,
-    )
+    corners, weights = mesh.faces.ravel(), np.repeat(face_vectors(mesh), 3, axis=0)
+    normals = np.stack([np.bincount(corners, along, len(mesh.vertices)) for along in weights.T], axis=1)
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     return np.where(length > 0, normals / np.where(length > 0, length, 1), [0.0, 0.0, 1.0]).astype(np.float32)
 

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import coo_matrix
+from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from slviewer.surface.shapes import Mesh
@@ -70,23 +70,31 @@ def half_edges(faces: np.ndarray) -> np.ndarray:
     return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
 
 
+def label_connected(pairs: np.ndarray, count: int) -> np.ndarray:
+    """Return the connected part (count,) int of each of ``count`` nodes that ``pairs`` (k, 2) of them join."""
+    graph = coo_array((np.ones(len(pairs), bool), tuple(pairs.T)), shape=(count, count))
+    return np.asarray(connected_components(graph, directed=False)[1])
+
+
 def face_groups(faces: np.ndarray, n_vertices: int, chosen: np.ndarray | None = None) -> np.ndarray:
     """Return the connected part (m,) int of each face, of those ``chosen`` (m,) bool alone; -1 for the others."""
     picked = faces if chosen is None else faces[chosen]
-    a, b = picked[:, [0, 1]].T, picked[:, [1, 2]].T
-    rows, columns = np.concatenate([a[0], b[0]]), np.concatenate([a[1], b[1]])
-    graph = coo_matrix((np.ones(len(rows), bool), (rows, columns)), shape=(n_vertices, n_vertices))
-    _, labels = connected_components(graph, directed=False)
+    labels = label_connected(picked[:, [0, 1, 1, 2]].reshape(-1, 2), n_vertices)
     groups = np.full(len(faces), -1)
     where = slice(None) if chosen is None else chosen
     _, groups[where] = np.unique(labels[picked[:, 0]], return_inverse=True)
     return groups
 
 
+def face_vectors(mesh: Mesh) -> np.ndarray:
+    """Return a vector (m, 3) along the normal of each face, as long as twice its area is large, mm2."""
+    a, b, c = mesh.vertices[mesh.faces].astype(np.float64).swapaxes(0, 1)
+    return np.cross(b - a, c - a)
+
+
 def face_areas(mesh: Mesh) -> np.ndarray:
     """Return the area (m,) mm2 of each face."""
-    a, b, c = (mesh.vertices[mesh.faces[:, k]].astype(np.float64) for k in range(3))
-    return np.asarray(np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2)
+    return np.asarray(np.linalg.norm(face_vectors(mesh), axis=1) / 2)
 
 
 def extent_across(points: np.ndarray) -> float:

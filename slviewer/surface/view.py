@@ -7,9 +7,11 @@ import numpy as np
 
 from slviewer.errors import InputError
 from slviewer.geometry.polynomial import monomials
+from slviewer.geometry.rigid import move_points
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.reconstruction.reconstruct import normals as grid_normals
 from slviewer.surface.clean import ExcludedPixels, clean, close_pinholes, viewing_cosines
+from slviewer.surface.overlap_kernels import SurfaceGrid
 
 LEAST_POINTS = 200
 FEATHER = 0.02
@@ -24,8 +26,8 @@ class View:
     """A cleaned scan, cropped to its surface.
 
     ``T`` (4, 4) float64: T_reference_scan. Images (h, w, ...) float32 in the camera's frame: ``points`` mm, NaN where
-    there is no surface; unit ``normals`` towards the camera; ``noise`` and ``lasting`` mm, the random and the
-    calibration's (systematic) standard deviation along the normal; ``inner``, a weight that rises from 0 at the scan's
+    there is no surface; unit ``normals`` towards the camera; ``noise`` and ``systematic`` mm, the random and the
+    calibration's standard deviation along the normal; ``inner``, a weight that rises from 0 at the scan's
     border to 1; ``quality``, smoothed information per area in 1/mm^4; ``colours`` (h, w, 3) uint8 or None. ``to_pixel``
     maps rays to pixels (see ``_fit_pixel_map``); ``spacing``: median distance of neighbouring points, mm; ``cleaned``:
     numbers of the excluded pixels.
@@ -35,7 +37,7 @@ class View:
     points: np.ndarray
     normals: np.ndarray
     noise: np.ndarray
-    lasting: np.ndarray
+    systematic: np.ndarray
     inner: np.ndarray
     quality: np.ndarray
     colours: np.ndarray | None
@@ -47,6 +49,18 @@ class View:
     def mask(self) -> np.ndarray:
         """(h, w) bool: pixels with a point."""
         return np.isfinite(self.points[..., 2])
+
+    @property
+    def grid(self) -> SurfaceGrid:
+        """What the kernels need to interpolate the surface."""
+        return SurfaceGrid(
+            self.points, self.normals, self.noise, self.systematic, self.inner, self.quality, self.to_pixel
+        )
+
+    def move_into(self, other: "View", points: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return points and normals (n, 3) of this view's frame in the frame of another one, contiguous."""
+        T = np.linalg.inv(other.T) @ self.T
+        return np.ascontiguousarray(move_points(T, points)), np.ascontiguousarray(normals @ T[:3, :3].T)
 
     def without(self, pixels: np.ndarray) -> "View":
         """Return the view without the points at ``pixels`` (h, w) bool."""
@@ -74,19 +88,19 @@ def prepare_view(name: str, cloud: Cloud, T_reference_scan: np.ndarray) -> View:
     points = np.where(surface[..., None], cloud.points[crop], np.float32(np.nan))
     cosine = viewing_cosines(points, normals)
     noise = _fill_noise(cloud.sigma_z[crop], points, cosine, surface)
-    lasting = np.zeros_like(noise) if cloud.sigma_lasting is None else cloud.sigma_lasting[crop]
+    systematic = np.zeros_like(noise) if cloud.sigma_systematic is None else cloud.sigma_systematic[crop]
     # an error dz of depth moves the point by dz (x/z, y/z, 1) along its ray; its component along the normal
     along = cosine * np.linalg.norm(points, axis=-1) / points[..., 2]
-    noise, lasting = noise * along, np.nan_to_num(lasting) * along
+    noise, systematic = noise * along, np.nan_to_num(systematic) * along
     inner = _border_weights(surface)
     area = _pixel_areas(points, cosine)
-    quality = np.where(surface, inner / ((noise**2 + lasting**2) * area), 0.0)
+    quality = np.where(surface, inner / ((noise**2 + systematic**2) * area), 0.0)
     return View(
         T=T,
         points=points,
         normals=normals,
         noise=noise.astype(np.float32),
-        lasting=lasting.astype(np.float32),
+        systematic=systematic.astype(np.float32),
         inner=inner,
         quality=_smooth(quality, surface),
         colours=_crop_colours(cloud.texture, crop),

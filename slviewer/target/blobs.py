@@ -7,6 +7,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from slviewer.geometry.rigid import Floats
+
 MIN_AREA_PX = 12
 """Smallest area of a blob whose shape can be judged."""
 MAX_ELONGATION = 4.0
@@ -20,13 +22,13 @@ class Blobs:
     """``centres`` (n, 2) px, ``areas`` (n,) px² and ``covariances`` (n, 2, 2) px² of elliptical blobs, all darker than
     their surroundings, or all brighter if ``inverted``."""
 
-    centres: NDArray[np.float64]
-    areas: NDArray[np.float64]
-    covariances: NDArray[np.float64]
+    centres: Floats
+    areas: Floats
+    covariances: Floats
     inverted: bool
 
     @property
-    def roundness(self) -> NDArray[np.float64]:
+    def roundness(self) -> Floats:
         """(n,) area over that of the ellipse with the same second moments: 1 for ellipses, 0.955 for rectangles."""
         return np.asarray(self.areas / (4 * np.pi * np.sqrt(np.linalg.det(self.covariances))))
 
@@ -34,7 +36,7 @@ class Blobs:
         """Return a subset of the blobs, by index or mask."""
         return Blobs(self.centres[which], self.areas[which], self.covariances[which], self.inverted)
 
-    def rescale(self, scale: NDArray[np.float64]) -> "Blobs":
+    def rescale(self, scale: Floats) -> "Blobs":
         """Return the blobs in the pixels of an image that is ``scale`` (2,) times as wide and as high."""
         centres = (self.centres + 0.5) * scale - 0.5
         return Blobs(centres, self.areas * scale.prod(), self.covariances * np.outer(scale, scale), self.inverted)

@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 
 from slviewer.errors import DetectionError
 from slviewer.target.board import Board
-from slviewer.target.images import SEARCH_PX, BoardImage, light_advice, resize_image
+from slviewer.target.images import SEARCH_PX, BoardImage, light_advice, resize_image, to_full_image
 from slviewer.target.numbering import check_grid
 from slviewer.target.saddle import refine_corners
 
@@ -33,8 +33,7 @@ def detect_charuco(board: Board, image: BoardImage) -> tuple[NDArray[np.float64]
         corners, ids, _, marker_ids = detector.detectBoard(small)
         markers = max(markers, 0 if marker_ids is None else len(marker_ids))
         if ids is not None and len(ids) and (best is None or len(ids) > len(best[1])):
-            pixels = (np.reshape(corners, (-1, 2)).astype(float) + 0.5) / factor - 0.5
-            best = pixels, np.ravel(ids).astype(int)
+            best = to_full_image(np.reshape(corners, (-1, 2)), factor), np.ravel(ids).astype(int)
         if best is not None and len(best[1]) >= SUFFICIENT_SHARE * len(board.points):
             break
     if best is not None and len(best[1]) >= MIN_CORNERS:

@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 
 from slviewer.errors import DetectionError
 from slviewer.target.board import Board
-from slviewer.target.images import SEARCH_PX, BoardImage, flatten_light, light_advice, resize_image
+from slviewer.target.images import SEARCH_PX, BoardImage, flatten_light, light_advice, resize_image, to_full_image
 from slviewer.target.numbering import check_grid, select_upright
 from slviewer.target.saddle import refine_corners
 
@@ -68,7 +68,7 @@ def _detect_by_sectors(board: Board, grey: np.ndarray) -> np.ndarray | None:
     ):
         success, corners = cv2.findChessboardCornersSB(resize_image(source, factor), board.features, flags=flags)
         if success:
-            return _to_full_image(corners, factor).reshape(board.rows, board.columns, 2)
+            return to_full_image(corners, factor).reshape(board.rows, board.columns, 2)
     return None
 
 
@@ -78,7 +78,7 @@ def _detect_largest(grey: np.ndarray) -> np.ndarray | None:
     flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_EXHAUSTIVE
     flattened = resize_image(flatten_light(grey), factor)
     success, corners, cells = cv2.findChessboardCornersSBWithMeta(flattened, (3, 3), flags)
-    return _to_full_image(corners, factor).reshape(*cells.shape[:2], 2) if success else None
+    return to_full_image(corners, factor).reshape(*cells.shape[:2], 2) if success else None
 
 
 def _detect_in_largest(board: Board, grey: np.ndarray) -> np.ndarray | None:
@@ -99,12 +99,7 @@ def _detect_by_squares(board: Board, grey: np.ndarray) -> np.ndarray | None:
     """Detect a grid (rows, columns, 2) px by OpenCV's older search, from square to square, or None."""
     factor = min(1.0, SEARCH_PX / max(grey.shape)) / 2
     success, corners = cv2.findChessboardCorners(resize_image(grey, factor), board.features)
-    return _to_full_image(corners, factor).reshape(board.rows, board.columns, 2) if success else None
-
-
-def _to_full_image(corners: np.ndarray, factor: float) -> np.ndarray:
-    """Convert pixels of an image ``factor`` times as large to those of the full image."""
-    return (corners.astype(float) + 0.5) / factor - 0.5
+    return to_full_image(corners, factor).reshape(board.rows, board.columns, 2) if success else None
 
 
 def _grid_orientation(grid: np.ndarray) -> float:

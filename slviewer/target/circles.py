@@ -72,20 +72,15 @@ def detect_circles(board: Board, image: BoardImage) -> tuple[NDArray[np.float64]
         # what one binarisation lacks, another may have: reflections and shadows cover parts of the board
         inverted = most.blobs.inverted
         pool = _pool_blobs(most.blobs, [attempt.blobs for attempt in tried if attempt.blobs.inverted == inverted])
-        grid = _match_board(board, complete_lattice(max(most.lattices, key=_count_nodes), pool), pool, image)
+        grid = _match_board(board, complete_lattice(max(most.lattices, key=len), pool), pool, image)
         if grid:
             return _measure(board, image, grid)
     raise DetectionError(_failure_message(board, image, most))
 
 
-def _count_nodes(lattice: Lattice) -> int:
-    """Return the number of nodes of a lattice."""
-    return len(lattice.nodes)
-
-
 def _size_of_largest(attempt: _Binarisation) -> int:
     """Return the number of nodes of the largest lattice; 0 without one."""
-    return max((len(lattice.nodes) for lattice in attempt.lattices), default=0)
+    return max(map(len, attempt.lattices), default=0)
 
 
 def _binarise_all(board: Board, grey: np.ndarray) -> Iterator[_Binarisation]:
@@ -107,7 +102,7 @@ def _binarise_all(board: Board, grey: np.ndarray) -> Iterator[_Binarisation]:
             for blobs in detect_blobs(small, pitch, inverted):
                 lattices = list(grow_lattices(blobs))
                 for lattice in lattices:
-                    if len(lattice.nodes) > CLUTTER_FREE_SHARE * len(board.points):
+                    if len(lattice) > CLUTTER_FREE_SHARE * len(board.points):
                         colours = [inverted]
                         resolved |= float(np.median(blobs.areas[lattice.blobs])) > RESOLVED_AREA_PX
                 yield _Binarisation(blobs.rescale(scale), lattices)
@@ -120,7 +115,7 @@ def _match_board(board: Board, lattice: Lattice, blobs: Blobs, image: BoardImage
 
     Raises DetectionError where the grid of circles is larger than the board.
     """
-    if len(lattice.nodes) <= CLUTTER_FREE_SHARE * len(board.points):
+    if len(lattice) <= CLUTTER_FREE_SHARE * len(board.points):
         return None
     for candidate in (lattice, complete_lattice(lattice, blobs)):
         places: dict[bytes, list[np.ndarray]] = {}
@@ -135,7 +130,7 @@ def _match_board(board: Board, lattice: Lattice, blobs: Blobs, image: BoardImage
             numberings, grid_map = fitting[0]
             if len(fitting) > 1 or _grid_continues(board, grid_map, blobs, numberings[0]):
                 raise DetectionError(
-                    f"{len(candidate.nodes)} circles in one grid detected where {board} has {len(board.points)}: "
+                    f"{len(candidate)} circles in one grid detected where {board} has {len(board.points)}: "
                     "check the board's columns and rows"
                 )
             return _Grid(blobs, numberings)
@@ -265,8 +260,8 @@ def _failure_message(board: Board, image: BoardImage, most: _Binarisation | None
     total = len(board.points)
     if most is None or _size_of_largest(most) < 6:
         return f"no grid of circles detected where {board} has {total}: {light_advice(image.grey)}"
-    lattice = max(most.lattices, key=_count_nodes)
-    detected = len(lattice.nodes)
+    lattice = max(most.lattices, key=len)
+    detected = len(lattice)
     longer, shorter = lattice.extent
     others = len(most.blobs.centres) - detected
     if detected >= total:

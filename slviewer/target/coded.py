@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slviewer.errors import InputError
+from slviewer.geometry.rigid import Floats
 from slviewer.target.drawing import Drawing
 
 DICTIONARIES = ("DICT_APRILTAG_36h11", "DICT_5X5_250", "DICT_6X6_250")
@@ -32,7 +33,7 @@ class CodedMarkers:
     of OpenCV. ``repeated``: numbers that were seen more than once, and are not among them."""
 
     ids: NDArray[np.int_]
-    corners: NDArray[np.float64]
+    corners: Floats
     repeated: tuple[int, ...] = ()
 
 
@@ -67,7 +68,7 @@ def _select(grey: np.ndarray, ids: np.ndarray, corners: np.ndarray, modules: int
     )
 
 
-def _refine_corners(grey: np.ndarray, quad: np.ndarray, modules: int) -> NDArray[np.float64] | None:
+def _refine_corners(grey: np.ndarray, quad: np.ndarray, modules: int) -> Floats | None:
     """Return the corners (4, 2) px where the marker's four sides meet, each a parabola through the places where the
     brightness is half way from the black border to the white around it; None where a side is not seen.
 
@@ -186,10 +187,4 @@ def _draw_mat(side: float) -> Drawing:
 
 def _add_marker(drawing: Drawing, number: int, left: float, top: float, side: float) -> None:
     """Add the black modules of a marker whose upper left corner is at (left, top) mm, neighbours in a row merged."""
-    modules = marker_modules(number) == 0
-    cell = side / len(modules)
-    for i, row in enumerate(np.pad(modules, ((0, 0), (1, 1))).astype(int)):
-        starts, ends = np.nonzero(np.diff(row) == 1)[0], np.nonzero(np.diff(row) == -1)[0]
-        drawing.rectangles += [
-            (left + a * cell, top + i * cell, (b - a) * cell, cell) for a, b in zip(starts, ends, strict=True)
-        ]
+    drawing.add_cells(marker_modules(number) == 0, left, top, side)

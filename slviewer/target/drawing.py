@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass, field
 
+import numpy as np
+
 MM_PER_POINT = 25.4 / 72
 LARGEST_PDF_MM = 14_400 * MM_PER_POINT
 """Side of the largest page that PDF viewers accept."""
@@ -21,6 +23,15 @@ class Drawing:
     """(x, y, width, height)"""
     texts: list[tuple[float, float, float, str]] = field(default_factory=list)
     """(x, y of the baseline, size of the letters, ASCII text)"""
+
+    def add_cells(self, black: np.ndarray, left: float, top: float, side: float) -> None:
+        """Add the black cells (m, m) bool of a square of ``side`` mm at (left, top), neighbours in a row merged."""
+        cell = side / len(black)
+        for i, row in enumerate(np.pad(black, ((0, 0), (1, 1))).astype(int)):
+            starts, ends = np.nonzero(np.diff(row) == 1)[0], np.nonzero(np.diff(row) == -1)[0]
+            self.rectangles += [
+                (left + a * cell, top + i * cell, (b - a) * cell, cell) for a, b in zip(starts, ends, strict=True)
+            ]
 
     def svg(self) -> bytes:
         """The drawing as an SVG file whose user unit is the millimetre."""

@@ -58,6 +58,11 @@ def resize_image(image: np.ndarray, factor: float) -> np.ndarray:
     )
 
 
+def to_full_image(pixels: np.ndarray, factor: float) -> np.ndarray:
+    """Convert pixels of an image ``factor`` times as large to those of the full image."""
+    return np.asarray((pixels.astype(float) + 0.5) / factor - 0.5)
+
+
 def flatten_light(grey: NDArray[np.uint8]) -> np.ndarray:
     """Divide an image (h, w) uint8 by the local maximum brightness, so that paper becomes evenly white."""
     factor = 64 / max(grey.shape)

@@ -47,6 +47,9 @@ class Lattice:
     nodes: np.ndarray
     blobs: np.ndarray
 
+    def __len__(self) -> int:
+        return len(self.nodes)
+
     @property
     def extent(self) -> tuple[int, int]:
         """Number of nodes along the longer and the shorter direction."""

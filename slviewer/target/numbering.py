@@ -9,9 +9,9 @@ same turned by 90 degrees takes, of its four numberings, the one whose x axis po
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slviewer.errors import DetectionError
+from slviewer.geometry.rigid import Floats
 from slviewer.target.board import Board
 from slviewer.target.planar import fit_grid_map, fit_homography, jacobians, to_image
 
@@ -23,20 +23,20 @@ MAX_BEND = 0.6
 """Largest distance, in pitches, by which a lens may distort the grid."""
 
 
-def select_upright(board: Board, pixels: NDArray[np.float64], numberings: list[np.ndarray]) -> np.ndarray:
+def select_upright(board: Board, pixels: Floats, numberings: list[np.ndarray]) -> np.ndarray:
     """Select one of several valid numberings, (n,) indices into ``pixels`` (m, 2), by the rule of this module."""
     preferred = np.array([1.0, 0.0] if len(numberings) == 4 else [2.0, 1.0])
     return max(numberings, key=lambda order: float(x_direction(board, pixels[order]) @ preferred))
 
 
-def x_direction(board: Board, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
+def x_direction(board: Board, pixels: Floats) -> Floats:
     """Return the mean direction (2,) of the board's x axis in the image, a unit vector."""
     x = board.points[:, 0] - board.points[:, 0].mean()
     direction = x @ (pixels - pixels.mean(0))
     return np.asarray(direction / np.linalg.norm(direction))
 
 
-def check_grid(board: Board, pixels: NDArray[np.float64], ids: np.ndarray, what: str) -> None:
+def check_grid(board: Board, pixels: Floats, ids: np.ndarray, what: str) -> None:
     """Raise DetectionError unless features at ``pixels`` (n, 2) are the image of a flat board through a real lens.
 
     ``ids`` (n,): indices into the board's points; ``what``: the features' name in messages. The pixels must agree with

@@ -4,18 +4,16 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from slviewer.errors import DetectionError
 from slviewer.geometry.polynomial import monomials
+from slviewer.geometry.rigid import Floats
 
 HUBER_SIGMAS = 3.0
 """Residuals beyond so many robust standard deviations are down-weighted in the fit of a grid's map."""
 
 
-def fit_homography(
-    points: NDArray[np.float64], pixels: NDArray[np.float64], robust: bool = False
-) -> NDArray[np.float64]:
+def fit_homography(points: Floats, pixels: Floats, robust: bool = False) -> Floats:
     """Fit the homography (3, 3) float64 from points (n, 2) mm to pixels (n, 2), with positive depth on the board.
 
     By least squares; ``robust``: by least median of squares, with up to half outliers. Raises DetectionError where the
@@ -27,12 +25,12 @@ def fit_homography(
     return np.asarray(H * np.sign(points.mean(0) @ H[2, :2] + H[2, 2]))
 
 
-def to_image(H: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
+def to_image(H: Floats, points: Floats) -> Floats:
     """Project points (n, 2) mm to pixels (n, 2) by a homography (3, 3)."""
     return np.asarray((points @ H[:2, :2].T + H[:2, 2]) / (points @ H[2, :2] + H[2, 2])[:, None])
 
 
-def jacobians(H: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
+def jacobians(H: Floats, points: Floats) -> Floats:
     """Return the Jacobians (n, 2, 2) px per mm of a homography (3, 3) at points (n, 2) mm."""
     w = points @ H[2, :2] + H[2, 2]
     return np.asarray((H[None, :2, :2] - to_image(H, points)[:, :, None] * H[2, :2]) / w[:, None, None])
@@ -47,25 +45,25 @@ class GridMap:
     lengths.
     """
 
-    H: NDArray[np.float64]
-    low: NDArray[np.float64]
-    span: NDArray[np.float64]
+    H: Floats
+    low: Floats
+    span: Floats
     degree: int
     coefficients: np.ndarray
-    residuals: NDArray[np.float64]
+    residuals: Floats
     sigma_px: float
 
-    def to_image(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    def to_image(self, points: Floats) -> Floats:
         """Map points (n, 2) in pitches to pixels (n, 2); extrapolates beyond the fitted features."""
         scaled = 2 * (points - self.low) / self.span - 1
         return to_image(self.H, points) + monomials(scaled, self.degree) @ self.coefficients
 
-    def pitch_px(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    def pitch_px(self, points: Floats) -> Floats:
         """Return the pitch (n,) px in the image at points (n, 2) in pitches; 0 behind the camera."""
         return np.sqrt(np.maximum(np.linalg.det(jacobians(self.H, points)), 0.0))
 
 
-def fit_grid_map(points: NDArray[np.float64], pixels: NDArray[np.float64], robust: bool = False) -> GridMap:
+def fit_grid_map(points: Floats, pixels: Floats, robust: bool = False) -> GridMap:
     """Fit the map from points (n, 2) in pitches to pixels (n, 2): a homography and a cubic polynomial.
 
     ``robust``: with Huber's weights, for up to a third of outliers. Raises DetectionError where the features do not

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erf
 
+from slviewer.geometry.rigid import Floats
 from slviewer.target.planar import fit_homography, jacobians
 
 MAX_HALF_WIDTH_PX = 11
@@ -24,11 +25,11 @@ CONVERGENCE_PX = 1e-3
 
 def refine_corners(
     image: NDArray[np.float32],
-    pixels: NDArray[np.float64],
-    points: NDArray[np.float64],
+    pixels: Floats,
+    points: Floats,
     pitch: float,
     marker: float = 0.0,
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+) -> tuple[Floats, NDArray[np.bool_]]:
     """Refine corners; returns sub-pixel positions (n, 2) float64 px and whether each fits the model, (n,) bool.
 
     ``image`` (h, w) float32; ``pixels`` (n, 2) px: initial positions, good to a px or two; ``points`` (n, 2) mm: the

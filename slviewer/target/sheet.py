@@ -67,35 +67,25 @@ def draw_board(board: Board, margin_mm: float | None = None) -> Drawing:
         if margin >= needed_margin:
             drawing.circles.append((first[0] + mark.x, first[1] + mark.y, mark.radius))
     else:
-        drawing.rectangles = [(x + first[0], y + first[1], w, h) for x, y, w, h in _black_squares(board)]
+        _add_black_squares(board, drawing, *first.tolist())
     _add_footer(board, drawing, bottom)
     return drawing
 
 
-def _black_squares(board: Board) -> list[tuple[float, float, float, float]]:
-    """Return the black rectangles (x, y, width, height) mm from the first inner corner; the top-left one is black."""
+def _add_black_squares(board: Board, drawing: Drawing, x: float, y: float) -> None:
+    """Add the black squares of a board whose first inner corner is at (x, y) mm; the top-left one is black."""
     p = board.pitch_mm
     columns, rows = board.features
-    dark = [((j - 1) * p, (i - 1) * p, p, p) for i in range(rows + 1) for j in range(columns + 1) if (i + j) % 2 == 0]
-    return dark + _marker_cells(board) if board.kind == "charuco" else dark
-
-
-def _marker_cells(board: Board) -> list[tuple[float, float, float, float]]:
-    """Return the black cells of the markers as rectangles (x, y, width, height) mm, neighbours in a row merged."""
+    for i, j in np.argwhere(np.indices((rows + 1, columns + 1)).sum(axis=0) % 2 == 0).tolist():
+        drawing.rectangles.append((x + (j - 1) * p, y + (i - 1) * p, p, p))
+    if board.kind != "charuco":
+        return
     charuco = opencv_board(board)
     dictionary = charuco.getDictionary()
-    cells = dictionary.markerSize + 2
-    side = board.marker_mm / cells
-    black: list[tuple[float, float, float, float]] = []
     for number, corners in zip(np.ravel(charuco.getIds()), charuco.getObjPoints(), strict=True):
-        left, top = (np.reshape(corners, (-1, 3))[:, :2].min(0).astype(float) - board.pitch_mm).tolist()
-        image = cv2.aruco.generateImageMarker(dictionary, int(number), cells, borderBits=1)
-        for i, row in enumerate(np.pad(image == 0, ((0, 0), (1, 1))).astype(int)):
-            starts, ends = np.nonzero(np.diff(row) == 1)[0], np.nonzero(np.diff(row) == -1)[0]
-            black += [
-                (left + a * side, top + i * side, (b - a) * side, side) for a, b in zip(starts, ends, strict=True)
-            ]
-    return black
+        left, top = np.reshape(corners, (-1, 3))[:, :2].min(0).astype(float) - p + (x, y)
+        image = cv2.aruco.generateImageMarker(dictionary, int(number), dictionary.markerSize + 2, borderBits=1)
+        drawing.add_cells(image == 0, float(left), float(top), board.marker_mm)
 
 
 def _add_footer(board: Board, drawing: Drawing, top: float) -> None:

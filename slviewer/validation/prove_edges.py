@@ -8,7 +8,7 @@ import numpy as np
 from slviewer.evaluation.render import Row
 from slviewer.fringe.phase import PhaseMap
 from slviewer.pipeline.feedback import Progress, ignore_progress
-from slviewer.reconstruction.reconstruct import normals, reconstruct
+from slviewer.reconstruction.reconstruct import normals, reconstruct_cloud
 from slviewer.simulation.boards import BoardScene, Pose, printed_board
 from slviewer.simulation.mesh import demo_object
 from slviewer.simulation.plans import rotation
@@ -89,7 +89,7 @@ def measure_object_edges(rig: SimulatedRig, seed: int = 0) -> tuple[float, float
 def _measure_depth_errors(rig: SimulatedRig, phase: PhaseMap, true_z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Depth errors (h, w) mm of the phase as decoded, and of the cloud that the program makes of it."""
     model = PerfectModel(rig)
-    return model.points(phase)[..., 2] - true_z, reconstruct(model, {"x": phase}).points[..., 2] - true_z
+    return model.points(phase)[..., 2] - true_z, reconstruct_cloud(model, {"x": phase}).points[..., 2] - true_z
 
 
 def _signed_distance(rig: SimulatedRig, scene: BoardScene) -> tuple[np.ndarray, np.ndarray]:

@@ -24,7 +24,7 @@ from slviewer.pipeline.capture_phases import decode_frames
 from slviewer.pipeline.feedback import Progress, ignore_progress, part
 from slviewer.pipeline.simulate import TARGET, turn_plan
 from slviewer.reconstruction.cloud import Cloud
-from slviewer.reconstruction.reconstruct import Model, reconstruct
+from slviewer.reconstruction.reconstruct import Model, reconstruct_cloud
 from slviewer.registration.markers import measure_markers
 from slviewer.registration.multiway import MultiwayAlignment, Starts, register_all
 from slviewer.registration.pairwise import Registration
@@ -122,7 +122,7 @@ def prove_registration(
     for i, (name, scene) in enumerate(scans.items()):
         progress(0.5 + 0.25 * i / len(scans), name)
         renderer = Renderer(rig, scene)
-        clouds[name] = reconstruct(model, {"x": render_phase(renderer, name, len(targets) + i)})
+        clouds[name] = reconstruct_cloud(model, {"x": render_phase(renderer, name, len(targets) + i)})
         known = np.flatnonzero(clouds[name].mask & renderer.truth().mask)[::_EVERY]
         measured.append(clouds[name].points.reshape(-1, 3)[known].astype(float))
         true.append(renderer.truth().points.reshape(-1, 3)[known])
@@ -147,7 +147,7 @@ def prove_registration(
     for k, (what, (wanted, *pair)) in enumerate(_make_ambiguous_pairs().items()):
         progress(0.95 + 0.01 * k, what)
         both = {
-            name: reconstruct(model, {"x": render_phase(Renderer(rig, scene), name, 900 + k)})
+            name: reconstruct_cloud(model, {"x": render_phase(Renderer(rig, scene), name, 900 + k)})
             for name, scene in zip("ab", pair, strict=True)
         }
         reason = _describe_refusal(both)
@@ -281,7 +281,7 @@ def _check_markers(
         sequence = one_axis(p18(rig.projector.size), "x")
         frames = Renderer(rig, scene).capture(sequence, number + k)
         phases = decode_frames(name, sequence, frames)
-        clouds[name] = reconstruct(model, phases, texture=texture(sequence, frames))
+        clouds[name] = reconstruct_cloud(model, phases, texture=texture(sequence, frames))
     markers = {name: measure_markers(cloud) for name, cloud in clouds.items()}
     T = register_all(clouds, "a", Starts(markers=markers)).T_reference_scan["b"]
     true = [T_calibrated_camera @ _to_matrix(scene.pose) for scene in pair]

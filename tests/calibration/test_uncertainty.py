@@ -25,7 +25,7 @@ from slviewer.calibration.stereo import StereoModel, calibrate_stereo
 from slviewer.errors import InputError
 from slviewer.inspection.relations import distance
 from slviewer.inspection.uncertainty import Spread, splined_shared
-from slviewer.reconstruction.reconstruct import reconstruct
+from slviewer.reconstruction.reconstruct import reconstruct_cloud
 from slviewer.session.ply import read_ply, write_ply
 from slviewer.simulation.rig import SimulatedRig
 from slviewer.validation.prove_uncertainty import BAND, PredictedErrors, compare_with_truth, judge_uncertainty
@@ -163,7 +163,7 @@ def test_a_cloud_knows_its_noise_and_its_calibration_apart_and_its_file_holds_th
 ) -> None:
     stereo, model = stereo_and_model
     phases = {"x": phase_map(true, np.full(true.camera.size[::-1], 600.0))}
-    cloud = reconstruct(model, phases)
+    cloud = reconstruct_cloud(model, phases)
     left, mask = cloud.sigma_calibration, cloud.mask
     assert left is not None and left.dtype == np.float32 and np.array_equal(np.isfinite(left), mask)
     noise = model.sigma_z(phases["x"], cloud.points)
@@ -174,7 +174,7 @@ def test_a_cloud_knows_its_noise_and_its_calibration_apart_and_its_file_holds_th
     scalars = read_ply(tmp_path / "cloud.ply").scalars
     assert set(scalars) == {"sigma_noise", "sigma_calibration", "sigma"}
     assert np.array_equal(scalars["sigma_calibration"], left[mask]) and (scalars["sigma"] >= noise[mask]).all()
-    plain = reconstruct(stereo, phases)
+    plain = reconstruct_cloud(stereo, phases)
     assert plain.sigma_calibration is None and np.array_equal(plain.sigma, plain.sigma_z, equal_nan=True)
     assert set(plain.sigmas(plain.mask)) == {"sigma_noise"}
 

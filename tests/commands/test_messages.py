@@ -19,7 +19,7 @@ import pytest
 import trimesh
 
 from slviewer.cli import COMMANDS, main
-from slviewer.fringe.patterns import render
+from slviewer.fringe.patterns import render_pattern
 from slviewer.fringe.presets import multifrequency
 from slviewer.fringe.sequence import PatternSequence, one_axis
 from slviewer.pipeline.import_calibration import import_opencv_calibration
@@ -56,7 +56,7 @@ form_mm = 5.0
 def render_plane(sequence: PatternSequence) -> np.ndarray:
     """Return frames (n, h, w) uint8 of a plane that faces both devices, FOCAL_PX * BASELINE_MM / SHIFT_PX mm away."""
     first = (PROJECTOR[0] - CAMERA[0]) // 2 + SHIFT_PX
-    images = [render(sequence, k)[:, first : first + CAMERA[0]] for k in range(len(sequence.frames))]
+    images = [render_pattern(sequence, k)[:, first : first + CAMERA[0]] for k in range(len(sequence.frames))]
     return np.stack([cv2.convertScaleAbs(image, alpha=0.7, beta=20) for image in images])
 
 

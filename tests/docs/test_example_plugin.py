@@ -14,7 +14,7 @@ import pytest
 from facts import missing_facts
 
 from slviewer.devices.drivers import DRIVER_PLUGINS, drivers
-from slviewer.fringe.patterns import render
+from slviewer.fringe.patterns import render_pattern
 from slviewer.fringe.presets import phase_steps
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.session.importers.layouts import LAYOUT_PLUGINS
@@ -115,7 +115,7 @@ def test_its_importer_and_exporter_work_in_commands(example: None, tmp_path: Pat
     for k in range(len(frames)):
         file = tmp_path / "part" / "xy"[k // 12] / f"{k % 12}.png"
         file.parent.mkdir(parents=True, exist_ok=True)
-        cv2.imwrite(str(file), cv2.convertScaleAbs(render(sequence, k), alpha=0.7, beta=20))
+        cv2.imwrite(str(file), cv2.convertScaleAbs(render_pattern(sequence, k), alpha=0.7, beta=20))
     status, printed, _ = run("import", "auto", "part", "session", "--projector", "240x240")
     assert status == 0
     assert "layout axisfolders" in printed and "1 capture imported as a target pose: part" in printed

@@ -23,7 +23,7 @@ from slviewer.fringe.presets import p18
 from slviewer.fringe.sequence import one_axis
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.rig import StereoRig
-from slviewer.reconstruction.reconstruct import reconstruct
+from slviewer.reconstruction.reconstruct import reconstruct_cloud
 from slviewer.simulation.boards import Pose, blank_board
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import letter
@@ -78,7 +78,7 @@ def bars():
 
 def outcome(artefact, bars, model):
     return conclude_test(
-        artefact, "stereo", [measure_artefact(artefact, reconstruct(model, p), words, words, R2) for words, p in bars]
+        artefact, "stereo", [measure_artefact(artefact, reconstruct_cloud(model, p), words, words, R2) for words, p in bars]
     )
 
 
@@ -148,7 +148,7 @@ def test_planes_are_flat_to_their_noise(count):
     for i, place in enumerate(plane_places(RIG, R2)[:count]):
         T = place.T_camera_artefact
         plate = blank_board(Pose(T[:3, :3], T[:3, 3]), (140.0, 110.0))
-        cloud = reconstruct(true_model(), phases_of(plate, 50 + i))
+        cloud = reconstruct_cloud(true_model(), phases_of(plate, 50 + i))
         found.append(measure_artefact(artefact, cloud, place.words, "plane", R2))
     test = conclude_test(artefact, "stereo", found)
     for position in found:

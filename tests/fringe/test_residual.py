@@ -183,7 +183,7 @@ def test_the_residual_is_the_noise_and_shows_who_is_wrong():
     sequence = SEQUENCES["p18"]
     stack = capture(sequence, COORDINATE, read=1.5, shot=0.01)
     clean = frame_residuals(sequence, stack, "x")
-    assert len(clean.frames) == 18 and clean.said == ""
+    assert len(clean.frames) == 18 and clean.message == ""
     assert all(0.9 < f.sigmas < 1.1 and 1.2 < f.rms < 2.5 for f in clean.frames)
     assert all(abs(f.light - 1) < 0.005 for f in clean.frames)
     wrong = frame_residuals(sequence, late(stack, 6), "x").frames

@@ -12,7 +12,7 @@ from slviewer.errors import InputError
 from slviewer.fringe import reference
 from slviewer.fringe.aliased_harmonics import AliasedHarmonics
 from slviewer.fringe.decode import decode
-from slviewer.fringe.patterns import profile, render
+from slviewer.fringe.patterns import profile, render_pattern
 from slviewer.fringe.presets import complementary, gray
 from slviewer.fringe.response import fit_gamma, linearise_levels, measure_nonlinearity, predict_phase_error
 from slviewer.fringe.sequence import PatternSequence
@@ -84,7 +84,7 @@ def test_the_table_concerns_cosines_alone():
             row, before = profile(sequence, k)[1], profile(plain, k)[1]
             assert np.array_equal(row, np.array(levels)[before])
             if frame.kind != "phase":
-                assert np.array_equal(render(sequence, k), render(plain, k))
+                assert np.array_equal(render_pattern(sequence, k), render_pattern(plain, k))
 
 
 def test_the_table_is_kept_with_the_sequence(tmp_path):

@@ -6,7 +6,7 @@ import pytest
 from facts import raises
 
 from slviewer.errors import InputError
-from slviewer.fringe.patterns import profile, render
+from slviewer.fringe.patterns import profile, render_pattern
 from slviewer.fringe.presets import PRESETS, complementary, gray, multifrequency, p18
 from slviewer.fringe.sequence import Frame, PatternSequence, PerAxis, parse_size
 
@@ -38,7 +38,7 @@ def test_gray_is_laid_out_as_procam_calibration():
 
 def test_rendered_cosine_and_bits():
     sequence = complementary((50, 30), 4, 16.0)
-    image = render(sequence, 1)
+    image = render_pattern(sequence, 1)
     assert image.shape == (30, 50) and image.dtype == np.uint8 and (image == image[0]).all()
     u = np.arange(50)
     assert np.abs(image[0] - (127.5 + 127.5 * np.cos(2 * np.pi * (u / 16 + 1 / 4)))).max() <= 0.5 + 1e-9
@@ -48,11 +48,11 @@ def test_rendered_cosine_and_bits():
         code = 2 * code + ((code & 1) ^ (profile(sequence, i)[1] > 0))
     np.testing.assert_array_equal(code, u // 8)  # half periods
     y = sequence.find("gray", "y")[-1]
-    assert (render(sequence, y) == render(sequence, y)[:, :1]).all()
+    assert (render_pattern(sequence, y) == render_pattern(sequence, y)[:, :1]).all()
     inverse = gray((50, 30))
     assert (profile(inverse, 0)[1] ^ profile(inverse, 1)[1] == 255).all()
     assert profile(inverse, len(inverse.frames) - 2)[0] is None
-    assert render(inverse, len(inverse.frames) - 1).max() == 0
+    assert render_pattern(inverse, len(inverse.frames) - 1).max() == 0
 
 
 def _frames(sequence, *without):
@@ -153,7 +153,7 @@ def test_a_sequence_without_a_projector_size():
     with raises(InputError, "projector"):
         _ = sequence.projector
     with raises(InputError, "projector"):
-        render(sequence, 0)
+        render_pattern(sequence, 0)
 
 
 @pytest.mark.parametrize(

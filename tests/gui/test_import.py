@@ -12,7 +12,7 @@ import pytest
 from playwright.sync_api import expect
 from wizard_page import CALM, Opened, button, choose, click
 
-from slviewer.fringe.patterns import render
+from slviewer.fringe.patterns import render_pattern
 from slviewer.fringe.presets import gray
 from slviewer.wizard.operator import Operator
 
@@ -32,7 +32,11 @@ def zip_of_captures() -> bytes:
     with zipfile.ZipFile(data, "w") as out:
         for name in ("capture_0", "capture_1"):
             for i in range(len(sequence.frames)):
-                frame = (render(sequence, i) * 0.5 + 40 + rng.normal(0, 1, PROJECTOR[::-1])).round().astype(np.uint8)
+                frame = (
+                    (render_pattern(sequence, i) * 0.5 + 40 + rng.normal(0, 1, PROJECTOR[::-1]))
+                    .round()
+                    .astype(np.uint8)
+                )
                 if (name, i) != ("capture_1", 4):
                     out.writestr(f"set/{name}/graycode_{i:02d}.png", cv2.imencode(".png", frame)[1].tobytes())
         out.writestr("set/notes.txt", "x")

@@ -13,7 +13,7 @@ from slviewer.devices.opening import Openable
 from slviewer.devices.protocols import CameraSettings, check_frame
 from slviewer.devices.simulated import SimulatedTurntable, simulated_rig
 from slviewer.devices.world import SimulatedWorld
-from slviewer.fringe.patterns import render
+from slviewer.fringe.patterns import render_pattern
 from slviewer.fringe.presets import gray_bits, phase_steps
 from slviewer.fringe.sequence import Frame, PatternSequence
 from slviewer.pipeline.conformance import (
@@ -173,7 +173,7 @@ def rendered(tmp_path: Path) -> Path:
     (folder := tmp_path / "rendered").mkdir()
     rng = np.random.default_rng(0)
     for k in range(len(SHOWN.frames)):
-        image = 8 * (render(SHOWN, k) * 0.7 + 20.0) + rng.normal(0, 4, SHOWN.projector_size[::-1])
+        image = 8 * (render_pattern(SHOWN, k) * 0.7 + 20.0) + rng.normal(0, 4, SHOWN.projector_size[::-1])
         cv2.imwrite(str(folder / f"shot{k:02d}.png"), image.round().astype(np.uint16))
     return folder
 

@@ -17,7 +17,7 @@ from slviewer.devices.world import SimulatedWorld
 from slviewer.errors import InputError
 from slviewer.fringe.decode import decode
 from slviewer.fringe.layout import to_eight_bits
-from slviewer.fringe.patterns import render
+from slviewer.fringe.patterns import render_pattern
 from slviewer.fringe.phase import Reason
 from slviewer.fringe.presets import gray, phase_steps
 from slviewer.fringe.reference import decode_reference
@@ -130,7 +130,7 @@ def test_pixels_at_the_full_scale_are_saturated(tmp_path: Path, full_scale: int)
 
 def test_a_full_scale_that_the_frames_contradict_is_refused() -> None:
     sequence = PatternSequence((64, 48), tuple(phase_steps("x", 4, 64.0)), relative=True, full_scale=1023)
-    frames = np.stack([np.uint16(16) * render(sequence, k) for k in range(4)])
+    frames = np.stack([np.uint16(16) * render_pattern(sequence, k) for k in range(4)])
     with raises(InputError, "full_scale", 1023, 4080):
         decode(sequence, frames, "x")
     with raises(InputError, "full_scale", 1023, "uint8"):
@@ -186,7 +186,7 @@ def write_frames(folder: Path, order: list[int] | None = None, head: str = "") -
     folder.mkdir()
     rng = np.random.default_rng(0)
     for number, index in enumerate(order or range(len(sequence.frames))):
-        image = render(sequence, index) * 0.5 + 40 + rng.normal(0, 1, (90, 120))
+        image = render_pattern(sequence, index) * 0.5 + 40 + rng.normal(0, 1, (90, 120))
         assert cv2.imwrite(str(folder / f"{number:02d}.png"), image.round().astype(np.uint16))
     groups = "".join(f"[[frame]]\n{_toml(frame)}" for frame in sequence.frames)
     (folder / "frames.toml").write_text(f'projector = "120x90"\norder = "name"\n{head}{groups}')

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from facts import missing_facts
 
-from slviewer.fringe.patterns import render
+from slviewer.fringe.patterns import render_pattern
 from slviewer.fringe.presets import gray, phase_steps
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.pipeline.capture_phases import decode_capture
@@ -35,7 +35,9 @@ def photographed(sequence: PatternSequence, seed: int) -> list[np.ndarray]:
     """What a camera with the projector's own pixels records: 8 bits, noise of one grey level, ambient light."""
     rng = np.random.default_rng(seed)
     return [
-        np.clip(render(sequence, i) * 0.5 + 40 + rng.normal(0, 1, PROJECTOR[::-1]), 0, 255).round().astype(np.uint8)
+        np.clip(render_pattern(sequence, i) * 0.5 + 40 + rng.normal(0, 1, PROJECTOR[::-1]), 0, 255)
+        .round()
+        .astype(np.uint8)
         for i in range(len(sequence.frames))
     ]
 

@@ -6,7 +6,7 @@ from facts import missing_facts, raises
 
 from slviewer.devices.protocols import CameraSettings, Rig
 from slviewer.errors import DeviceError, InputError
-from slviewer.fringe.patterns import render
+from slviewer.fringe.patterns import render_pattern
 from slviewer.fringe.presets import PRESETS
 from slviewer.pipeline.suggest_exposure import STATES, suggest_exposure
 
@@ -46,7 +46,7 @@ class Bench:
         self.sequence = sequence
 
     def show(self, index):
-        self.shown = render(self.sequence, index)[self.place] / 255
+        self.shown = render_pattern(self.sequence, index)[self.place] / 255
 
     def show_level(self, grey):
         self.shown = np.full(self.light.shape, (grey or 0) / 255)

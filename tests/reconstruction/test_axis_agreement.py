@@ -13,7 +13,7 @@ from slviewer.errors import InputError
 from slviewer.fringe.phase import PhaseMap
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.rig import StereoRig
-from slviewer.reconstruction.axis_agreement import check_phases, check_sizes, measure_agreement
+from slviewer.reconstruction.axis_agreement import check_phases, check_sizes, measure_axis_agreement
 
 pytestmark = pytest.mark.computes
 
@@ -68,7 +68,7 @@ def test_the_misfit_of_a_sound_capture_is_its_noise() -> None:
     true, found = rig(), coordinates(rig())
     v, u = np.nonzero(np.isfinite(found[..., 0]))
     pixels = np.column_stack([u, v]).astype(float)
-    agreement = measure_agreement(by(true), pixels, found[v, u], np.full((len(u), 2), SIGMA_PX))
+    agreement = measure_axis_agreement(by(true), pixels, found[v, u], np.full((len(u), 2), SIGMA_PX))
     assert agreement is not None
     assert agreement.misfit_px == pytest.approx(SIGMA_PX, rel=0.05)
     assert agreement.ratio == pytest.approx(1.0, abs=0.05)

@@ -8,7 +8,7 @@ from facts import raises
 
 from slviewer.errors import InputError
 from slviewer.reconstruction.cloud import Cloud
-from slviewer.reconstruction.reconstruct import normals, reconstruct
+from slviewer.reconstruction.reconstruct import normals, reconstruct_cloud
 
 SHAPE = (30, 40)
 
@@ -57,14 +57,14 @@ def phases(*axes: str) -> dict:
 
 
 def test_the_axis_with_the_smaller_sigma_is_taken() -> None:
-    assert reconstruct(FakeModel({"x": 0.02, "y": 0.5}), phases("x", "y")).axis == "x"
+    assert reconstruct_cloud(FakeModel({"x": 0.02, "y": 0.5}), phases("x", "y")).axis == "x"
     model = FakeModel({"x": 0.5, "y": 0.02})
-    cloud = reconstruct(model, phases("x", "y"))
+    cloud = reconstruct_cloud(model, phases("x", "y"))
     assert (cloud.axis, cloud.model) == ("y", "fake")
     assert np.nanmedian(cloud.sigma_z) == np.float32(0.02)
-    assert reconstruct(model, phases("x", "y"), axis="x").axis == "x"
-    assert reconstruct(model, phases("x")).axis == "x"
-    assert reconstruct(FakeModel({"x": 0.1}), phases("x", "y")).axis == "x"
+    assert reconstruct_cloud(model, phases("x", "y"), axis="x").axis == "x"
+    assert reconstruct_cloud(model, phases("x")).axis == "x"
+    assert reconstruct_cloud(FakeModel({"x": 0.1}), phases("x", "y")).axis == "x"
 
 
 def test_sigma_is_compared_on_the_same_pixels() -> None:
@@ -78,9 +78,9 @@ def test_sigma_is_compared_on_the_same_pixels() -> None:
 
     both = phases("x", "y")
     both["y"].offset[:20] = np.nan
-    assert reconstruct(Uneven({"x": 1, "y": 1}), both).axis == "x"
+    assert reconstruct_cloud(Uneven({"x": 1, "y": 1}), both).axis == "x"
     both["x"].offset[5:] = np.nan
-    assert reconstruct(Uneven({"x": 1, "y": 1}), both).axis == "y"  # nothing in common, and y measures more
+    assert reconstruct_cloud(Uneven({"x": 1, "y": 1}), both).axis == "y"  # nothing in common, and y measures more
 
 
 def test_what_the_calibrations_own_phases_scatter_by_is_part_of_sigma() -> None:
@@ -88,7 +88,7 @@ def test_what_the_calibrations_own_phases_scatter_by_is_part_of_sigma() -> None:
         def excess_px(self, axis: str) -> float:
             return 0.4
 
-    cloud = reconstruct(Scattering({"x": 0.02}), phases("x"))
+    cloud = reconstruct_cloud(Scattering({"x": 0.02}), phases("x"))
     np.testing.assert_allclose(cloud.sigma_z, 0.02 * 0.5 / 0.3, rtol=1e-5)
 
 
@@ -96,7 +96,7 @@ def test_blur_at_edges_masks_a_pixel_or_adds_to_its_uncertainty() -> None:
     phase = FakePhase("x", np.zeros(SHAPE))
     phase.edge_error_px = np.zeros(SHAPE, np.float32)
     phase.edge_error_px[4], phase.edge_error_px[7] = 0.4, 3.1  # of a noise of 0.3 px, 0.02 mm
-    cloud = reconstruct(FakeModel({"x": 0.02}), {"x": phase})
+    cloud = reconstruct_cloud(FakeModel({"x": 0.02}), {"x": phase})
     assert not cloud.mask[7].any() and cloud.mask.mean() == 29 / 30
     np.testing.assert_allclose(cloud.sigma_z[4], 0.02, rtol=1e-6)  # what averaging lessens
     np.testing.assert_allclose(cloud.sigma[4], 0.02 * np.hypot(1, 4 / 3), rtol=1e-6)
@@ -105,11 +105,11 @@ def test_blur_at_edges_masks_a_pixel_or_adds_to_its_uncertainty() -> None:
 
 def test_missing_axes_are_named() -> None:
     with raises(InputError, "axis y", "x"):
-        reconstruct(FakeModel({"x": 1, "y": 1}), phases("x"), axis="y")
+        reconstruct_cloud(FakeModel({"x": 1, "y": 1}), phases("x"), axis="y")
     with raises(InputError, "fake", "axis y", "x"):
-        reconstruct(FakeModel({"x": 1}), phases("x", "y"), axis="y")
+        reconstruct_cloud(FakeModel({"x": 1}), phases("x", "y"), axis="y")
     with raises(InputError, "axis y", "fake", "x"):
-        reconstruct(FakeModel({"x": 1}), phases("y"))
+        reconstruct_cloud(FakeModel({"x": 1}), phases("y"))
 
 
 def test_cloud_and_its_texture() -> None:

@@ -15,7 +15,7 @@ from slviewer.fringe.sequence import one_axis
 from slviewer.geometry.rigid import move_points, rigid_transform
 from slviewer.pipeline.capture_phases import decode_frames
 from slviewer.reconstruction.cloud import Cloud
-from slviewer.reconstruction.reconstruct import reconstruct
+from slviewer.reconstruction.reconstruct import reconstruct_cloud
 from slviewer.registration.markers import MeasuredMarkers, fit_marker_pose, marker_notes, measure_markers
 from slviewer.registration.multiway import Starts, register_all
 from slviewer.registration.refusal import Refused
@@ -42,7 +42,7 @@ def scan(scene: MarkedScene, seed: int) -> Cloud:
     sequence = one_axis(p18(RIG.projector.size), "x")
     frames = Renderer(RIG, scene).capture(sequence, seed)
     phases = decode_frames("scan", sequence, frames)
-    return reconstruct(PerfectModel(RIG), phases, texture=texture(sequence, frames))
+    return reconstruct_cloud(PerfectModel(RIG), phases, texture=texture(sequence, frames))
 
 
 def true_motion(a: Pose, b: Pose) -> np.ndarray:

@@ -14,7 +14,7 @@ from websockets.exceptions import ConnectionClosed
 from slviewer.devices.browser import PageChannels
 from slviewer.devices.browser_projector import BrowserProjector, ProjectorChannel, browser_projector
 from slviewer.errors import DeviceError, InputError
-from slviewer.fringe.patterns import render
+from slviewer.fringe.patterns import render_pattern
 from slviewer.fringe.presets import complementary
 from slviewer.fringe.sequence import Frame, PatternSequence
 from slviewer.server.device_pages import serve_device_pages
@@ -146,11 +146,11 @@ def test_every_pixel_of_a_pattern_is_one_pixel_of_the_screen(opens, channel, pro
     ready(channel, projector)
     for index in KINDS:
         projector.show(index)
-        assert shows(page, render(SEQUENCE, index)), SEQUENCE.frames[index]
+        assert shows(page, render_pattern(SEQUENCE, index)), SEQUENCE.frames[index]
     projector.show_level(129)
     assert shows(page, np.full(SIZE[::-1], 129, np.uint8))
     projector.show(0)
-    assert shows(page, render(SEQUENCE, 0)), "even light must leave the patterns loaded"
+    assert shows(page, render_pattern(SEQUENCE, 0)), "even light must leave the patterns loaded"
 
 
 def test_frames_appear_in_the_order_in_which_they_are_asked_for(opens, channel, projector):
@@ -185,7 +185,7 @@ def test_frames_appear_in_the_order_in_which_they_are_asked_for(opens, channel, 
 
     def fingerprint(index: int) -> int:
         total = 0
-        for grey in render(SEQUENCE, index).ravel().tolist():
+        for grey in render_pattern(SEQUENCE, index).ravel().tolist():
             total = (total * 31 + grey) % 1000003
         return total
 
@@ -246,7 +246,7 @@ def test_a_screen_of_another_size_is_refused_in_words(opens, channel, projector)
     expect(page.locator("h1")).to_have_text("slviewer projector")
     ready(channel, projector)
     projector.show(1)
-    assert shows(page, render(SEQUENCE, 1))
+    assert shows(page, render_pattern(SEQUENCE, 1))
 
 
 def test_a_click_fills_the_screen_and_leaving_it_ends_the_capture(opens, channel, projector):
@@ -315,7 +315,7 @@ def test_a_reload_ends_the_capture_and_the_next_one_is_whole(opens, channel, pro
         projector.show(5)
     projector.load(SEQUENCE)
     projector.show(4)
-    assert shows(page, render(SEQUENCE, 4))
+    assert shows(page, render_pattern(SEQUENCE, 4))
 
 
 def test_a_lost_connection_is_made_again_by_the_page(opens, channel, projector):
@@ -329,7 +329,7 @@ def test_a_lost_connection_is_made_again_by_the_page(opens, channel, projector):
     projector.close()
     ready(channel, projector)
     projector.show(2)
-    assert shows(page, render(SEQUENCE, 2))
+    assert shows(page, render_pattern(SEQUENCE, 2))
 
 
 def test_a_server_that_starts_again_finds_its_page(browser, channel, tmp_path):
@@ -382,7 +382,7 @@ def test_a_page_that_hangs_is_given_up(opens, channel, projector):
     page.evaluate("delete link.socket.send; for (const text of late) link.socket.send(text)")
     projector.load(SEQUENCE)
     projector.show(1)
-    assert shows(page, render(SEQUENCE, 1)), "an answer that came too late is not taken for the next one's"
+    assert shows(page, render_pattern(SEQUENCE, 1)), "an answer that came too late is not taken for the next one's"
 
 
 def test_a_window_that_changes_and_changes_back_still_ends_the_capture(opens, channel, projector):
@@ -397,7 +397,7 @@ def test_a_window_that_changes_and_changes_back_still_ends_the_capture(opens, ch
         projector.show(1)
     projector.load(SEQUENCE)
     projector.show(1)
-    assert shows(page, render(SEQUENCE, 1))
+    assert shows(page, render_pattern(SEQUENCE, 1))
 
 
 def test_a_hidden_page_is_no_projector(opens, channel, projector):
@@ -418,7 +418,7 @@ def test_a_second_window_takes_over_only_when_it_is_asked_to(opens, channel, pro
     second = opens()
     expect(second.locator("h1")).to_have_text(ELSEWHERE)
     projector.show(1)
-    assert shows(first, render(SEQUENCE, 1)), "it must not disturb the first"
+    assert shows(first, render_pattern(SEQUENCE, 1)), "it must not disturb the first"
     second.get_by_role("button", name="Use this window instead").click()
     expect(first.locator("h1")).to_have_text(ELSEWHERE)
     with raises(DeviceError, "another window"):
@@ -427,11 +427,11 @@ def test_a_second_window_takes_over_only_when_it_is_asked_to(opens, channel, pro
     assert channel.wait_ready(HANG_S).state == "ready"
     projector.load(SEQUENCE)
     projector.show(2)
-    assert shows(second, render(SEQUENCE, 2))
+    assert shows(second, render_pattern(SEQUENCE, 2))
     first.reload()
     expect(first.locator("h1")).to_have_text(ELSEWHERE)
     projector.show(3)
-    assert shows(second, render(SEQUENCE, 3))
+    assert shows(second, render_pattern(SEQUENCE, 3))
 
 
 def test_the_operator_is_led_to_the_page_with_its_rights_alone(browser, server, channel, projector_page):

@@ -14,7 +14,7 @@ from facts import missing_facts
 from faults import FAULTS, KILL, Disk, Killed, watching
 
 from slviewer.errors import SessionError
-from slviewer.fringe.patterns import render
+from slviewer.fringe.patterns import render_pattern
 from slviewer.fringe.presets import gray
 from slviewer.pipeline.import_captures import import_captures
 from slviewer.pipeline.inspect import inspect
@@ -140,7 +140,7 @@ def test_an_import_that_was_interrupted_continues(tmp_path, fault):
     for number in range(3):
         (folder := source / f"capture_{number}").mkdir(parents=True)
         for i in range(len(sequence.frames)):
-            image = np.clip(render(sequence, i) * 0.5 + 40 + rng.normal(0, 1, (40, 60)), 0, 255).round()
+            image = np.clip(render_pattern(sequence, i) * 0.5 + 40 + rng.normal(0, 1, (40, 60)), 0, 255).round()
             cv2.imwrite(str(folder / f"graycode_{i:02d}.png"), image.astype(np.uint8))
 
     def attempt(folder: Path, disk: Disk) -> list[str]:

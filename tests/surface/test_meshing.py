@@ -10,7 +10,7 @@ from slviewer.errors import InputError, SlviewerError
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.surface.edit import decimate, drop_small_parts, fill_holes, smooth
 from slviewer.surface.fuse import fuse
-from slviewer.surface.meshing import BuiltMesh, MeshingPlan, build_mesh, grid_mesh, spacing
+from slviewer.surface.meshing import BuiltMesh, MeshingPlan, build_mesh, grid_mesh, measure_spacing
 from slviewer.surface.poisson import trim_far_patches
 from slviewer.surface.shapes import Mesh, PointSet
 from slviewer.surface.tools import select_faces
@@ -70,7 +70,7 @@ def test_what_floats_where_nothing_was_measured_goes_whatever_holes_are_filled(p
         np.concatenate([ball.vertices, ball.vertices + np.array([200, 0, 0])]),
         np.concatenate([ball.faces, ball.faces + n]),
     )
-    kept, report = trim_far_patches(two, points, spacing(points), np.inf)
+    kept, report = trim_far_patches(two, points, measure_spacing(points), np.inf)
     assert len(kept.faces) == len(ball.faces) and (report.filled, report.imagined, report.cut) == (0, 0.0, 1)
 
 
@@ -84,7 +84,7 @@ def test_a_foot_is_closed_flat() -> None:
     found = build_mesh(points, MeshingPlan("poisson", watertight=True))
     assert found.trimmed is not None and (found.trimmed.filled, found.trimmed.flattened) == (1, 1)
     cap = np.pi * RADIUS**3 * (0.5**2 * (3 - 0.5)) / 3
-    beyond = 3.0 * spacing(points)  # so far the surface still counts as measured
+    beyond = 3.0 * measure_spacing(points)  # so far the surface still counts as measured
     assert VOLUME - cap < found.topology.volume_mm3 < VOLUME - cap + beyond * np.pi * (0.87 * RADIUS) ** 2
     assert found.mesh.vertices[:, 2].min() > -0.5 * RADIUS - beyond
     assert missing_facts(found.text(), "flat") == []

@@ -11,7 +11,7 @@ import pytest
 from facts import missing_facts
 from wizard_events import HANG_S, list_texts
 
-from slviewer.fringe.patterns import render
+from slviewer.fringe.patterns import render_pattern
 from slviewer.fringe.presets import gray
 from slviewer.pipeline.import_calibration import import_opencv_calibration
 from slviewer.session.exporters import write_calibration
@@ -36,7 +36,7 @@ def source(tmp_path: Path) -> Path:
         folder.mkdir(parents=True)
         rng = np.random.default_rng(n)
         for i in range(len(sequence.frames)):
-            frame = render(sequence, i) * 0.5 + 40 + rng.normal(0, 1, PROJECTOR[::-1])
+            frame = render_pattern(sequence, i) * 0.5 + 40 + rng.normal(0, 1, PROJECTOR[::-1])
             cv2.imwrite(str(folder / f"graycode_{i:02d}.png"), frame.round().astype(np.uint8))
     (tmp_path / "source" / "capture_1" / "graycode_05.png").unlink()
     return tmp_path / "source"
