@@ -197,10 +197,9 @@ def _select_indices(shot: Shot, kind: str, axis: str) -> list[int]:
 def lose_frames(frames: np.ndarray, level: float, shot: Shot) -> np.ndarray:
     """Drop a Gray frame of y (level 0), a phase step of x (1), or both (2); later frames move forward."""
     phase_x, gray_y = _select_indices(shot, "phase", "x"), _select_indices(shot, "gray", "y")
-    if level == 0:
-        return drop_frame(frames, gray_y[2])
-    frames = drop_frame(frames, phase_x[3])
-    return drop_frame(frames, gray_y[2]) if level == 2 else frames
+    if level != 0:
+        frames = drop_frame(frames, phase_x[3])
+    return frames if level == 1 else drop_frame(frames, gray_y[2])
 
 
 def repeat_frames(frames: np.ndarray, level: float, shot: Shot) -> np.ndarray:
@@ -227,9 +226,9 @@ def exchange_axis_frames(frames: np.ndarray, level: float, shot: Shot) -> np.nda
 def reverse_bits(frames: np.ndarray, level: float, shot: Shot) -> np.ndarray:
     """Gray bits in reverse order: of x (level 0), of both axes (1), of both with the complementary one (2)."""
     for axis in ("x",) if level == 0 else ("x", "y"):
-        places = _select_indices(shot, "gray", axis) + (
-            _select_indices(shot, "complementary", axis) if level == 2 else []
-        )
+        places = _select_indices(shot, "gray", axis)
+        if level == 2:
+            places += _select_indices(shot, "complementary", axis)
         frames = show_instead(frames, places, places[::-1])
     return frames
 

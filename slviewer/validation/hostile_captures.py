@@ -156,10 +156,10 @@ class HostileBench:
             verify(session, [name], shape, models=self.models, radius=radius, warn=report.warnings.append)  # type: ignore[arg-type]
         except SlviewerError as error:
             report.warnings.append(str(error))
-        return compare_with_truth(done.cloud, *truth)
+        return match_with_truth(done.cloud, *truth)
 
 
-def compare_with_truth(cloud: Cloud, renderer: Renderer, clean: Renderer) -> MeasuredScan:
+def match_with_truth(cloud: Cloud, renderer: Renderer, clean: Renderer) -> MeasuredScan:
     """The cloud's points beside those that a perfect instrument would measure, of the scene as it was."""
     truth = renderer.truth()
     points = truth.points

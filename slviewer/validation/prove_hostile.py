@@ -18,12 +18,12 @@ import numpy as np
 
 from slviewer.errors import SlviewerError, UsageError
 from slviewer.evaluation.render import Row
-from slviewer.geometry.rigid import fit_rigid
+from slviewer.geometry.rigid import fit_rigid, move_points
 from slviewer.pipeline.feedback import Progress, ignore_progress
 from slviewer.simulation.hostile import FAULTS, SEVERITIES, Direction, Fault, Severity
 from slviewer.simulation.rig import letter
 from slviewer.validation.hostile_captures import SCANS, CaseReport, HostileBench, MeasuredScan
-from slviewer.validation.proof import Proof
+from slviewer.validation.proof import Proof, root_mean_square
 
 MOST_OVER_FLOOR = 1.5
 """Times the undisturbed RMS, within which a case is measured."""
@@ -93,8 +93,7 @@ class HostileCase:
 
     def row(self) -> Row:
         """The case as a row of the table."""
-        nan = float("nan")
-        figures = self.figures or Figures(nan, nan, nan, nan)
+        figures = self.figures or Figures(*[float("nan")] * 4)
         return {
             "fault": self.fault,
             "severity": self.severity,
@@ -133,7 +132,6 @@ def prove_hostile(
         for i, (name, severity, direction) in enumerate(chosen):
             progress((i + 1) / (len(chosen) + 1), f"{name}, {severity}, in the {direction}")
             done.append(trial.run(name, severity, direction))
-    progress(1.0, "proven")
     failed = [case for case in done if not case.passed]
     lines = [f"{len(done) - len(failed)} of {len(done)} hold, at scale {scale:g}"]
     for case in failed:
@@ -181,14 +179,13 @@ class _Trial:
         start, report = perf_counter(), CaseReport()
         measured: Sequence[MeasuredScan] = ()
         try:
-            measured = (self._measure_faulty_scans if direction == "scan" else self._measure_after_faulty_calibration)(
-                FAULTS[name], severity, report
-            )
+            measure = self._measure_faulty_scans if direction == "scan" else self._measure_after_faulty_calibration
+            measured = measure(FAULTS[name], severity, report)
         except Exception as error:  # the other cases still have to run
             report.error = error
         gauge = self._gauge if direction == "scan" or not measured else fit_gauge(measured)
         figures = score(measured, gauge) if measured else None
-        outcome, named = judge(FAULTS[name], severity, report, figures, self._floor)
+        outcome, named = judge_case(FAULTS[name], severity, report, figures, self._floor)
         messages = [*report.warnings, *([f"{type(report.error).__name__}: {report.error}"] if report.error else [])]
         seconds = perf_counter() - start
         return HostileCase(
@@ -215,71 +212,76 @@ class _Trial:
         return [bench.measure(session, name, bench.capture(name)[1:], report) for name in SCANS]
 
 
-def judge(
+def judge_case(
     fault: Fault, severity: Severity, report: CaseReport, figures: Figures | None, floor: Figures
 ) -> tuple[Outcome, tuple[str, ...]]:
     """The outcome of a case, and the causes that the program named."""
-    named = list(report.named)
-    texts = [*report.warnings, *([str(report.error)] if report.error and not named else [])]
-    named += [causes for pattern, causes in _WORDS if any(re.search(pattern, text) for text in texts)]
-    maybe = [causes for pattern, causes in _OPEN if any(re.search(pattern, text) for text in texts)]
-    named += [causes for causes in maybe if causes & fault.causes]
+    texts = [*report.warnings, *([str(report.error)] if report.error and not report.named else [])]
+    named = report.named + _match_causes(_WORDS, texts)
+    named += [causes for causes in _match_causes(_OPEN, texts) if causes & fault.causes]
     words = tuple(dict.fromkeys("|".join(sorted(each)) for each in named))
-    right = any(each & fault.causes for each in named)
-    must = fault.must_measure and severity == "mild"
     if report.error is not None and not isinstance(report.error, SlviewerError):
         return "CRASH", words
+    is_right = any(each & fault.causes for each in named)
+    must_measure = fault.must_measure and severity == "mild"
     if figures is None or report.error is not None:
-        return ("WRONG REASON" if not right else "TURNED AWAY" if must else "refused"), words
-    good = figures.rms_mm <= MOST_OVER_FLOOR * floor.rms_mm and figures.gross <= floor.gross + GROSS
-    wrong = figures.rms_mm > SIGMAS * figures.predicted_mm or figures.gross > floor.gross + GROSS
-    if named and not right:
+        return ("WRONG REASON" if not is_right else "TURNED AWAY" if must_measure else "refused"), words
+    if named and not is_right:
         return "WRONG REASON", words
-    if good and figures.coverage >= LEAST_COVERAGE * floor.coverage:
-        return "measured", words
-    if must:
-        return ("SILENTLY WRONG" if wrong and not right else "TURNED AWAY"), words
-    if right:
-        return "degraded, warned", words
-    if wrong:
-        return "SILENTLY WRONG", words
-    return (
-        "noisier as predicted" if figures.coverage >= EXPLAINED_LOSS * floor.coverage else "UNEXPLAINED LOSS"
-    ), words
+    return _judge_figures(figures, floor, is_right, must_measure), words
 
 
-def fit_gauge(measured: Sequence[MeasuredScan]) -> tuple[np.ndarray, np.ndarray]:
-    """R (3, 3) and t (3,) mm that carry the measured points of all scans onto their truth.
+def _match_causes(facts: Sequence[tuple[str, frozenset[str]]], texts: Sequence[str]) -> list[frozenset[str]]:
+    """The causes whose pattern is in one of the texts."""
+    return [causes for pattern, causes in facts if any(re.search(pattern, text) for text in texts)]
+
+
+def _judge_figures(figures: Figures, floor: Figures, is_right: bool, must_measure: bool) -> Outcome:
+    """The outcome of a measured case; ``is_right``: a message names its cause."""
+    has_gross = figures.gross > floor.gross + GROSS
+    is_good = figures.rms_mm <= MOST_OVER_FLOOR * floor.rms_mm and not has_gross
+    is_wrong = figures.rms_mm > SIGMAS * figures.predicted_mm or has_gross
+    if is_good and figures.coverage >= LEAST_COVERAGE * floor.coverage:
+        return "measured"
+    if is_right and not must_measure:
+        return "degraded, warned"
+    if is_wrong and not is_right:
+        return "SILENTLY WRONG"
+    if must_measure:
+        return "TURNED AWAY"
+    return "noisier as predicted" if figures.coverage >= EXPLAINED_LOSS * floor.coverage else "UNEXPLAINED LOSS"
+
+
+def fit_gauge(measured: Sequence[MeasuredScan]) -> np.ndarray:
+    """T_truth_measured (4, 4) mm that carries the measured points of all scans onto their truth.
 
     Least squares over the better nine tenths of the targets' points.
     """
     points = np.concatenate([m.points[m.on_target] for m in measured])
     truth = np.concatenate([m.truth[m.on_target] for m in measured])
-    R, t = np.eye(3), np.zeros(3)
+    T = np.eye(4)
     inliers = np.ones(len(points), bool)
     for _ in range(3):
-        if np.count_nonzero(inliers) < 10:
+        if inliers.sum() < 10:
             break
         T = fit_rigid(points[inliers], truth[inliers])
-        R, t = T[:3, :3], T[:3, 3]
-        off = np.linalg.norm(points @ R.T + t - truth, axis=1)
+        off = np.linalg.norm(move_points(T, points) - truth, axis=1)
         inliers = off <= np.quantile(off, 0.9)
-    return R, t
+    return T
 
 
-def score(measured: Sequence[MeasuredScan], gauge: tuple[np.ndarray, np.ndarray]) -> Figures:
+def score(measured: Sequence[MeasuredScan], gauge: np.ndarray) -> Figures:
     """The figures of scans, errors of z in mm after the motion of ``gauge``."""
-    R, t = gauge
-    errors = np.concatenate([(m.points @ R.T + t - m.truth)[:, 2] for m in measured])
+    errors = np.concatenate([(move_points(gauge, m.points) - m.truth)[:, 2] for m in measured])
     sigma = np.concatenate([m.sigma for m in measured])
     target = np.concatenate([m.on_target for m in measured])
     expected = sum(m.expected for m in measured)
     wrong = ~(np.abs(errors) <= SIGMAS * sigma)  # also where nothing is to be seen
-    most = max(1, int(_TRIMMED * np.count_nonzero(target)))
-    squares, predicted = np.sort(errors[target] ** 2)[:most], np.sort(sigma[target] ** 2)[:most]
+    most = max(1, int(_TRIMMED * target.sum()))
+    rms, predicted = (root_mean_square(np.sort(np.abs(values[target]))[:most]) for values in (errors, sigma))
     return Figures(
-        float(np.sqrt(squares.mean())) if len(squares) else float("nan"),
-        float(np.sqrt(predicted.mean())) if len(predicted) else float("nan"),
+        rms,
+        predicted,
         float(wrong.mean()) if len(wrong) else 0.0,
-        float(np.count_nonzero(target) / max(expected, 1)),
+        float(target.sum() / max(expected, 1)),
     )

@@ -13,7 +13,7 @@ from slviewer.inspection.fitting import fit_feature
 from slviewer.inspection.form import form_error, orientation_error, position_error, profile_error
 from slviewer.inspection.quantities import Quantity
 from slviewer.pipeline.feedback import Progress, ignore_progress
-from slviewer.validation.proof import BandCheck, Proof, prove_checks
+from slviewer.validation.proof import BandCheck, Proof, prove_checks, track
 
 REPEATS = 200
 NOISE_MM = 0.02
@@ -40,8 +40,7 @@ def prove_plan(
     """
     side = int(SIDE * max(scale, 0.7))
     rows, checks = [], []
-    for k, (kind, measure) in enumerate(CASES.items()):
-        progress(k / len(CASES), kind)
+    for k, (kind, measure, _) in enumerate(track(progress, CASES)):
         cases = [measure(side, np.random.default_rng([seed, k, i])) for i in range(repeats)]
         truths, U = np.array([truth for truth, _ in cases]), np.array([q.U or 0.0 for _, q in cases])
         errors = np.array([q.value for _, q in cases]) - truths
@@ -59,7 +58,6 @@ def prove_plan(
                 "covered %": round(covered, 1),
             }
         )
-    progress(1.0, "proven")
     record = {"noise_mm": NOISE_MM, "points": side**2, "repeats": repeats, "rows": rows}
     return prove_checks(checks, scale, rows, record)
 

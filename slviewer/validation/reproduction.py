@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 import numpy as np
@@ -29,6 +30,7 @@ from slviewer.report.data import (
 )
 from slviewer.report.page import write_page
 from slviewer.report.reproduction import reproduction_headlines, reproduction_sections, reproduction_title
+from slviewer.validation.proof import root_mean_square
 
 MODELS = ("stereo", "pixelwise", "splined")
 
@@ -50,16 +52,14 @@ class Reproduction:
     def in_range_ratio(self) -> float:
         """Mean stereo RMS over mean pixelwise RMS, over the planes with at least 87 % of their points in R2."""
         inside = [c for c in self.planes.values() if c.incidence and c.incidence["R2"] >= 87.0]
-        means = [float(np.mean([c.results[m].rms_mm for c in inside])) for m in MODELS]
-        return means[0] / means[1]
+        stereo, pixelwise = (fmean(c.results[m].rms_mm for c in inside) for m in MODELS[:2])
+        return stereo / pixelwise
 
     @property
     def spacing_rms_mm(self) -> dict[str, float]:
         """RMS error of the distances between all pairs of sphere centres, by model."""
-        return {
-            m: float(np.sqrt(np.mean([(measured[m] - known) ** 2 for known, measured in self.spacings_mm.values()])))
-            for m in MODELS
-        }
+        spacings = self.spacings_mm.values()
+        return {m: root_mean_square(np.array([measured[m] - known for known, measured in spacings])) for m in MODELS}
 
     def to_json(self) -> dict[str, Any]:
         """All figures that ``text`` shows, and the values that they are computed from."""
@@ -173,8 +173,8 @@ def _make_report_data(
         ],
         pixel_curve=curve_at(pixel, pixelwise, stereo, observations, pixelwise.depth_axis),
         rms_maps_mm=fit.rms_mm,
-        plane_maps=[error_maps(f"plane_{i:02d}", result.planes[f"plane_{i:02d}"]) for i in SHOWN_PLANES],
-        sphere_maps=[error_maps(name, c) for name, c in result.spheres.items()],
+        plane_maps=[_make_error_maps(f"plane_{i:02d}", result.planes[f"plane_{i:02d}"]) for i in SHOWN_PLANES],
+        sphere_maps=[_make_error_maps(name, c) for name, c in result.spheres.items()],
         plane_outlines={name: _outline_plane(c, stereo.rig.camera.rays()) for name, c in result.planes.items()},
         clouds=clouds,
         merged=CloudView("merged", whole.surface.points, whole.surface.normals, whole.source, whole.names),
@@ -209,7 +209,7 @@ def _make_sphere_row(name: str, comparison: Comparison, theirs: letter.SpherePos
     )
 
 
-def error_maps(title: str, comparison: Comparison) -> ErrorMaps:
+def _make_error_maps(title: str, comparison: Comparison) -> ErrorMaps:
     """The signed errors of every model over the pixels that counted."""
     maps = {m: np.where(r.inliers, r.error_map, np.nan) for m, r in comparison.results.items()}
     floors = list(_get_noise_floor(comparison).values())
