@@ -4,10 +4,10 @@ A device belongs to the thread that opened it. Every method raises `DeviceError`
 open or was unplugged; after that, `close` and `open` are the way back, and `close` never raises.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Literal, Protocol, runtime_checkable
+from typing import Literal, Protocol, get_args, runtime_checkable
 
 import numpy as np
 
@@ -128,6 +128,19 @@ _MAX_ANGLE_DEG = 1e5
 
 Channel = Literal["red", "green", "blue", "grey"]
 """What a colour camera decodes; green has the most pixels under a Bayer mosaic, and the most light of most lamps."""
+
+
+def check_channel(channel: str) -> None:
+    """Raise InputError unless `channel` is one of `Channel`."""
+    if channel not in get_args(Channel):
+        raise InputError(f"no channel is called {channel!r}: use one of {', '.join(get_args(Channel))}")
+
+
+def check_size(what: str, size: Sequence[int], most_px: int = 2**16) -> tuple[int, int]:
+    """Return the (width, height) px of `what`, a camera or a projector. Raises InputError for anything else."""
+    if len(size) != 2 or not all(isinstance(side, int) and 0 < side <= most_px for side in size):
+        raise InputError(f"{size!r} is not the size of a {what}: give its width and height in px, such as [1280, 720]")
+    return size[0], size[1]
 
 
 def extract_channel(rgb: np.ndarray, channel: Channel, out: np.ndarray) -> None:

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from slviewer.devices.capture import capture
+from slviewer.devices.capture import capture_frames
 from slviewer.devices.protocols import stated_full_scale
 from slviewer.fringe.presets import phase_steps
 from slviewer.fringe.residual import frame_residuals
@@ -31,7 +31,7 @@ def check_order(bench: RigUnderTest) -> tuple[Check, Check]:
     sequence = PatternSequence(projector, frames, full_scale=stated_full_scale(bench.rig.camera))
     bench.show(None, "order of the frames")
     bench.wait()
-    stack = capture(replace(bench.rig, settle_ms=bench.settle_ms), sequence, sleep=bench.clock.sleep)
+    stack = capture_frames(replace(bench.rig, settle_ms=bench.settle_ms), sequence, sleep=bench.clock.sleep)
     return _judge_order(bench, sequence, stack), check_repeats(sequence, stack)
 
 

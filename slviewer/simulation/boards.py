@@ -115,7 +115,7 @@ class BoardScene:
         assert self.board is not None
         step = self.board.pitch_mm / 4
         shape = [int(np.ceil(length / step)) for length in reversed(self.plate)]
-        middle = np.array(self.corner) + (np.stack(np.indices(shape)[::-1], -1) + 0.5) * step
+        middle = np.array(self.corner) + (np.moveaxis(np.indices(shape)[::-1], 0, -1) + 0.5) * step
         return cKDTree(self.features[:, :2]).query(middle)[1].astype(np.int32)
 
 

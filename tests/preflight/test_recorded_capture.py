@@ -10,7 +10,7 @@ import pytest
 from imperfect_rig import Imperfections, imperfect
 
 from slviewer.cli import main
-from slviewer.devices.capture import capture
+from slviewer.devices.capture import capture_frames
 from slviewer.devices.simulated import simulated_rig
 from slviewer.devices.world import SimulatedWorld
 from slviewer.fringe.presets import complementary, gray, p18
@@ -34,7 +34,7 @@ def frames_of(
     rig, _ = imperfect(simulated_rig(world), Imperfections(**wrong))
     sequence = sequence_of(rig.projector.size)
     with rig.opened():
-        stack = capture(rig, sequence)
+        stack = capture_frames(rig, sequence)
     stack.flags.writeable = False  # tests share it
     return sequence, stack
 
