@@ -47,7 +47,7 @@ class ViserGate:
         if self._client is None:
             self._client = inside.client_of(self._server, self._connection)
         usable = isinstance(raw, bytes) and (self._role == "operate" or len(raw) < VIEWER_LIMIT)
-        message = inside.decode(raw) if usable else None
+        message = inside.decode_message(raw) if usable else None
         if message is None or self._client is None:
             logger.debug("client %s: dropped a message that is none", self._client)
             return None
@@ -84,7 +84,7 @@ class ViserGate:
             case messages.FileTransferStartUpload():
                 button = self._require_input(message.source_component_uuid)
                 _check(isinstance(button, viser.GuiUploadButtonHandle))
-                return inside.encode(self._uploads.start(message))
+                return inside.encode_message(self._uploads.start(message))
             case messages.FileTransferPart():
                 self._uploads.part(message)
             case messages.ScenePointerMessage():
@@ -129,7 +129,7 @@ class ViserGate:
             inside.refuse_upload(
                 self._server, self._client, message.source_component_uuid, message.transfer_uuid, message.size_bytes
             )
-            inside.notify(self._server, self._client, "Not uploaded", f"The file was refused: {refused}.")
+            inside.show_error(self._server, self._client, "Not uploaded", f"The file was refused: {refused}.")
         elif isinstance(message, messages.GuiUpdateMessage) and refused.correct:
             handle = inside.gui_input(self._server, self._client, message.uuid)
             if handle is not None and not (inside.is_private(handle) and self._role != "operate"):

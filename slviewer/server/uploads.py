@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from slviewer.server.access import MessageRefused
-from slviewer.server.text import safe_name
+from slviewer.server.text import safe_file_name
 
 SMALLEST_PART = 4096
 """Bytes; viser's page sends half a megabyte at a time. Smaller parts would cost more memory than they carry."""
@@ -55,7 +55,7 @@ class Uploads:
             self._budget.used += size
             self._budget.names.add(message.transfer_uuid)
             self._transfers[message.transfer_uuid] = _Transfer(message.source_component_uuid, size, parts)
-        return replace(message, filename=safe_name(message.filename))
+        return replace(message, filename=safe_file_name(message.filename))
 
     def part(self, message: Any) -> None:
         """Count one part (a FileTransferPart) in; Refused, and the upload forgotten, where it was not announced."""

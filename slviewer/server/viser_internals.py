@@ -42,19 +42,19 @@ PAGE_SCRIPT = resources.files("slviewer.server").joinpath("page_script.js").read
 """Our script, which runs in viser's page before its own."""
 
 FROM_CLIENTS: dict[str, type[Any]] = {
-    kind.__name__: kind
-    for kind in (
-        _messages.ViewerCameraMessage,
-        _messages.GuiUpdateMessage,
-        _messages.CommandTriggerMessage,
-        _messages.FileTransferStartUpload,
-        _messages.FileTransferPart,
-        _messages.TransformControlsUpdateMessage,
-        _messages.TransformControlsDragStartMessage,
-        _messages.TransformControlsDragEndMessage,
-        _messages.SceneNodeClickMessage,
-        _messages.ScenePointerMessage,
-        _messages.LocalStorageGetItemResponseMessage,
+    name: getattr(_messages, name)
+    for name in (
+        "ViewerCameraMessage",
+        "GuiUpdateMessage",
+        "CommandTriggerMessage",
+        "FileTransferStartUpload",
+        "FileTransferPart",
+        "TransformControlsUpdateMessage",
+        "TransformControlsDragStartMessage",
+        "TransformControlsDragEndMessage",
+        "SceneNodeClickMessage",
+        "ScenePointerMessage",
+        "LocalStorageGetItemResponseMessage",
     )
 }
 """The messages that a client has reason to send; opening and closing a share tunnel is not among them."""
@@ -84,11 +84,7 @@ def start(serve: Callable[..., Any], host: str, port: int, label: str | None) ->
         server._websock_server.unregister_handler(kind)
     # A button that does nothing would be shown again by every later change of the theme.
     themed = partial(server.gui.configure_theme, show_logo=False, show_share_button=False)
-    for owner, name, value in (
-        (server, "request_share_url", _refuse_tunnel),
-        (server.gui, "configure_theme", themed),
-    ):
-        setattr(owner, name, value)
+    server.request_share_url, server.gui.configure_theme = _refuse_tunnel, themed  # type: ignore
     themed()
     return server
 
@@ -130,21 +126,18 @@ def _silence_prints() -> Iterator[None]:
         rich.print = printing
 
 
-def decode(raw: bytes) -> Message | None:
+def decode_message(raw: bytes) -> Message | None:
     """The message in these bytes with every field of its declared type; None if it is anything else."""
     try:
         fields = msgspec.msgpack.decode(raw)
         kind = FROM_CLIENTS[fields.pop("type")]
-        if not fields.keys() <= {
-            field.name for field in dataclasses.fields(kind)
-        }:  # viser fails on a field that it does not know
-            return None
-        return msgspec.convert(fields, kind)
+        known = {field.name for field in dataclasses.fields(kind)}
+        return msgspec.convert(fields, kind) if fields.keys() <= known else None  # viser fails on unknown fields
     except (msgspec.MsgspecError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
         return None
 
 
-def encode(message: Message) -> bytes:
+def encode_message(message: Message) -> bytes:
     """The bytes in which a client sends this message."""
     return msgspec.msgpack.encode({"type": type(message).__name__, **vars(message)})
 
@@ -308,7 +301,7 @@ def refuse_upload(server: viser.ViserServer, client_id: int, source: str, transf
     _queue_message(server, client_id, _messages.RemoveNotificationMessage(f"upload-{transfer}"))
 
 
-def notify(server: viser.ViserServer, client_id: int, title: str, body: str) -> None:
+def show_error(server: viser.ViserServer, client_id: int, title: str, body: str) -> None:
     """Show an error to one client."""
     client = server._connected_clients.get(client_id)
     if client is not None:
