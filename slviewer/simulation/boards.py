@@ -125,21 +125,18 @@ def printed_board(
     shape: BoardShape = FLAT,
     seed: int = 0,
     margin_mm: float | None = None,
-    diameter_mm: float | None = None,
     marked: bool = False,
 ) -> BoardScene:
     """Return the scene of `board` printed on a plate, `margin_mm` around its outer features (default 1.5 pitches).
 
-    `seed` draws the circles' misplacement, the same for every pose of one board. Circles are half a pitch wide unless
-    `diameter_mm` says otherwise; `marked` adds the mark of the printed sheets. Raises `InputError` for ChArUco boards,
-    which the simulation does not print.
+    `seed` draws the circles' misplacement, the same for every pose of one board. Circles are half a pitch wide;
+    `marked` adds the mark of the printed sheets. Raises `InputError` for ChArUco boards, which the simulation does not
+    print.
     """
     if board.kind not in ("circles", "acircles", "chessboard"):
         kind = "ChArUco" if board.kind == "charuco" else board.kind
         raise InputError(f"the simulation does not print {kind} boards: use circles, acircles or a chessboard")
-    diameter = (board.pitch_mm / 2 if diameter_mm is None else diameter_mm) if board.kind != "chessboard" else 0.0
-    if diameter > 0.6 * board.pitch_mm:
-        raise InputError(f"circles of {diameter:g} mm at a pitch of {board.pitch_mm:g} mm: give 0.6 pitches at most")
+    diameter = 0.0 if board.kind == "chessboard" else board.pitch_mm / 2
     margin = 1.5 * board.pitch_mm if margin_mm is None else margin_mm
     low, high = board.points[:, :2].min(0) - margin, board.points[:, :2].max(0) + margin
     corner, plate = ((float(x), float(y)) for x, y in (low, high - low))

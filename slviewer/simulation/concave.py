@@ -175,14 +175,13 @@ class ConcaveScene(MeshScene):
 
 
 def groove(
-    pose: Pose, angle_deg: float = 90.0, albedo: float = 0.8, indirect: Indirect = Indirect(),
-    width_mm: float = 60.0, length_mm: float = 90.0,
-) -> ConcaveScene:  # fmt: skip
-    """Return a V-groove: two walls of ``width_mm`` that meet at ``angle_deg`` in a fold along y, open towards -z."""
+    pose: Pose, angle_deg: float = 90.0, albedo: float = 0.8, indirect: Indirect = Indirect(), length_mm: float = 90.0
+) -> ConcaveScene:
+    """Return a V-groove: two walls 60 mm wide that meet at ``angle_deg`` in a fold along y, open towards -z."""
     if not 20 <= angle_deg <= 170:
         raise InputError(f"a groove of {angle_deg:g} degrees cannot be simulated: choose 20 to 170")
     half = np.radians(angle_deg / 2)
-    away = _graded_steps(width_mm)
+    away = _graded_steps(60.0)
     along = np.linspace(-length_mm / 2, length_mm / 2, int(np.ceil(length_mm / _COARSEST_MM)) + 1)
     walls = []
     for side in (-1, 1):
@@ -193,10 +192,7 @@ def groove(
     return _make_scene(np.concatenate(walls), both, pose, albedo, indirect)
 
 
-def bowl(
-    pose: Pose, radius_mm: float = 60.0, opening_deg: float = 70.0, albedo: float = 0.8,
-    indirect: Indirect = Indirect(),
-) -> ConcaveScene:  # fmt: skip
+def bowl(pose: Pose, radius_mm: float = 60.0, opening_deg: float = 70.0, albedo: float = 0.8) -> ConcaveScene:
     """Return the inside of a sphere, up to ``opening_deg`` from its deepest point, which is the origin; open to -z."""
     if not 10 <= opening_deg <= 90:
         raise InputError(f"a bowl open to {opening_deg:g} degrees cannot be simulated: choose 10 to 90")
@@ -208,16 +204,14 @@ def bowl(
     polar = np.radians(opening_deg) * np.hypot(x, y)
     share = np.where(polar > 0, np.sin(polar) / np.maximum(np.hypot(x, y), 1e-12), 0) * radius_mm
     grid = np.stack([x * share, y * share, radius_mm * (np.cos(polar) - 1)], axis=-1)
-    return _make_scene(grid, _grid_patches(a.shape), pose, albedo, indirect)
+    return _make_scene(grid, _grid_patches(a.shape), pose, albedo, Indirect())
 
 
-def wax(pose: Pose, size_mm: float = 90.0, relief_mm: float = 4.0, indirect: Indirect | None = None) -> ConcaveScene:
-    """Return a wavy plate of wax, in which 60 % of the light scatters, facing -z."""
-    side = np.linspace(-size_mm / 2, size_mm / 2, int(np.ceil(size_mm / 1.5)) + 1)
-    x, y = np.meshgrid(side, side, indexing="ij")
-    z = relief_mm * np.sin(2 * np.pi * x / 45) * np.cos(2 * np.pi * y / 60)
-    light = Indirect(0, scattered=0.6, reach_mm=3.0) if indirect is None else indirect
-    return _make_scene(np.stack([x, y, z], axis=-1), _grid_patches(x.shape), pose, 0.8, light)
+def wax(pose: Pose, indirect: Indirect = Indirect(0, scattered=0.6, reach_mm=3.0)) -> ConcaveScene:
+    """Return a wavy plate of wax of 90 mm, in which 60 % of the light scatters, facing -z."""
+    x, y = np.meshgrid(*[np.linspace(-45.0, 45.0, 61)] * 2, indexing="ij")
+    z = 4.0 * np.sin(2 * np.pi * x / 45) * np.cos(2 * np.pi * y / 60)
+    return _make_scene(np.stack([x, y, z], axis=-1), _grid_patches(x.shape), pose, 0.8, indirect)
 
 
 CONCAVE: dict[str, Callable[[Pose], ConcaveScene]] = {"groove": groove, "bowl": bowl, "wax": wax}

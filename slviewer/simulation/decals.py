@@ -91,11 +91,12 @@ def marked_sphere(pose: Pose) -> MarkedScene:
     return MarkedScene(sphere(tuple(pose.t.tolist()), 2 * radius), pose, decals)
 
 
-def marked_cylinder(pose: Pose, radius: float = 40.0, length: float = 150.0) -> MarkedScene:
+def marked_cylinder(pose: Pose) -> MarkedScene:
     """An open cylinder about the y axis with six markers on its front."""
+    radius = 40.0
     places = ((-30, -40.0), (0, -45.0), (30, -40.0), (-25, 35.0), (5, 40.0), (30, 35.0))
     decals = [_stick_on_front(i, 14.0, (around, 0), radius, y) for i, (around, y) in enumerate(places)]
-    return MarkedScene(MeshScene(*cylinder_mesh(radius, length), pose), pose, decals)
+    return MarkedScene(MeshScene(*cylinder_mesh(radius, 150.0), pose), pose, decals)
 
 
 def _stick_on_front(number: int, side_mm: float, turn_deg: tuple[float, float], radius: float, y: float = 0.0) -> Decal:

@@ -143,10 +143,10 @@ def _time_captures(rig: SimulatedRig, scene: Any, counts: tuple[float, ...] = CA
     return rows
 
 
-def _time_scans(rig: SimulatedRig, counts: tuple[int, ...] = SCANS, steps: int = STEPS) -> list[Row]:
-    """Rows of registering scans of an object on a turntable that makes ``steps`` or more, with made-up noise."""
+def _time_scans(rig: SimulatedRig, counts: tuple[int, ...] = SCANS) -> list[Row]:
+    """Rows of registering scans of an object on a turntable that makes `STEPS` or more, with made-up noise."""
     rng, clouds = np.random.default_rng(0), {}
-    steps = max(steps, *counts)
+    steps = max(STEPS, *counts)
     for name, scene in turning(steps).items():
         points = Renderer(rig, scene).truth().points
         points[..., 2] += rng.normal(0, NOISE_MM, points.shape[:2])

@@ -7,7 +7,7 @@ import numpy as np
 
 from slviewer.evaluation.render import Row
 from slviewer.fringe.phase import PhaseMap
-from slviewer.pipeline.feedback import Progress, ignore_progress
+from slviewer.pipeline.feedback import Progress
 from slviewer.reconstruction.reconstruct import normals, reconstruct
 from slviewer.simulation.boards import BoardScene, Pose, printed_board
 from slviewer.simulation.mesh import demo_object
@@ -33,7 +33,7 @@ _BINS_PX = 0.5
 _NEAR_PX = 3
 
 
-def prove_edges(scale: float = 1.0, *, seed: int = 0, progress: Progress = ignore_progress) -> Proof:
+def prove_edges(scale: float, seed: int, progress: Progress) -> Proof:
     """Measure the ridges of a printed plane and the edges of the demo object, with and without the correction."""
     rows: list[Row] = []
     checks: list[BandCheck] = []

@@ -14,7 +14,7 @@ from slviewer.errors import InputError
 from slviewer.fringe.phase import PhaseMap
 from slviewer.geometry.rigid import move_points, transform_from_rvec
 from slviewer.geometry.shapes import fit_plane
-from slviewer.pipeline.feedback import Progress, ignore_progress, part
+from slviewer.pipeline.feedback import Progress, part
 from slviewer.pipeline.simulate import TARGET
 from slviewer.simulation.boards import Pose, printed_board
 from slviewer.simulation.plans import planes, rotation, target_poses
@@ -52,25 +52,18 @@ class WayFigures:
     seconds: float
 
 
-def prove_guidance(
-    scale: float = 1.0,
-    *,
-    rigs: int = RIGS,
-    poses: int = POSES,
-    seed: int = 0,
-    progress: Progress = ignore_progress,
-) -> Proof:
-    """Calibrate each of ``rigs`` simulated rigs from ``poses`` guided poses, and from as many drawn at random as the
+def prove_guidance(scale: float, seed: int, progress: Progress) -> Proof:
+    """Calibrate each of ``RIGS`` simulated rigs from ``POSES`` guided poses, and from as many drawn at random as the
     Letter's were; measure the Letter's ten planes with both.
     """
     figures: list[WayFigures] = []
-    ways = {f"rig {k + 1} of {rigs}, {way}": (seed + k, way) for k in range(rigs) for way in _WAYS}
+    ways = {f"rig {k + 1} of {RIGS}, {way}": (seed + k, way) for k in range(RIGS) for way in _WAYS}
     for _, (rig_seed, way), report in track(progress, ways):
         if way == _WAYS[0]:
             rig = letter(scale, rig_seed)
             targets = [_render_plane(rig, name, 100 + i) for i, name in enumerate(planes())]
         start = perf_counter()
-        observations, predicted = (_observe_guided if way == "guided" else _observe_random)(rig, poses, report)
+        observations, predicted = (_observe_guided if way == "guided" else _observe_random)(rig, POSES, report)
         report(0.9, "calibrating")
         model = calibrate_observed(rig, observations)[1]
         rms, floor, supported, unmeasured = zip(*(_measure_plane(model, t) for t in targets), strict=True)

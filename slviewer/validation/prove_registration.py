@@ -21,7 +21,7 @@ from slviewer.fringe.sequence import one_axis
 from slviewer.geometry.rigid import fit_rigid, move_points
 from slviewer.inspection.deviation import deviation
 from slviewer.pipeline.capture_phases import decode_frames
-from slviewer.pipeline.feedback import Progress, ignore_progress, part
+from slviewer.pipeline.feedback import Progress, part
 from slviewer.pipeline.simulate import TARGET, turn_plan
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.reconstruction.reconstruct import Model, reconstruct
@@ -109,19 +109,17 @@ def _make_row(scan: str, onto: str, pair: Registration, shift: float, turn: floa
     }
 
 
-def prove_registration(
-    scale: float = 1.0, *, poses: int = POSES, seed: int = 0, progress: Progress = ignore_progress
-) -> Proof:
+def prove_registration(scale: float, seed: int, progress: Progress) -> Proof:
     """Calibrate a rendered rig, scan and register three depths and a turn, mesh them, and try what must be refused."""
     rig = letter(scale, seed)
-    plan = turn_plan(rig, Board.parse(TARGET), poses)
+    plan = turn_plan(rig, Board.parse(TARGET), POSES)
     model: Model = calibrate_rendered(rig, plan, part(progress, 0.0, 0.5))[1]
     scans = {name: scene for name, scene in plan.items() if isinstance(scene, MeshScene)}
     clouds: dict[str, Cloud] = {}
     measured, true = [], []
     for name, scene, _ in track(progress, scans, 0.5, 0.75):
         renderer = Renderer(rig, scene)
-        clouds[name] = reconstruct(model, {"x": render_phase(renderer, name, poses + len(clouds))})
+        clouds[name] = reconstruct(model, {"x": render_phase(renderer, name, POSES + len(clouds))})
         known = np.flatnonzero(clouds[name].mask & renderer.truth().mask)[::_EVERY]
         measured.append(clouds[name].points.reshape(-1, 3)[known].astype(float))
         true.append(renderer.truth().points.reshape(-1, 3)[known])

@@ -14,7 +14,7 @@ from slviewer.fringe.decode import decode
 from slviewer.fringe.phase import Reason
 from slviewer.fringe.presets import PRESETS
 from slviewer.fringe.sequence import PatternSequence, one_axis
-from slviewer.pipeline.feedback import Progress, ignore_progress
+from slviewer.pipeline.feedback import Progress
 from slviewer.simulation.boards import Pose
 from slviewer.simulation.concave import Indirect, bowl, groove, wax
 from slviewer.simulation.plans import objects, planes, rotation, spheres
@@ -82,7 +82,7 @@ def surface_cases() -> dict[str, tuple[Scene, bool]]:
     return {name: (scene, name in lit) for name, scene in (lit | clean).items()}
 
 
-def prove_surfaces(scale: float = 0.5, *, seed: int = 0, progress: Progress = ignore_progress) -> Proof:
+def prove_surfaces(scale: float, seed: int, progress: Progress) -> Proof:
     """Measure every surface with p18, complementary, multifrequency and micro; judge gain, mask and false alarms.
 
     ``scale``: resolution of the camera, as a share of the Letter's.

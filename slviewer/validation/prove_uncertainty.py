@@ -18,7 +18,7 @@ from slviewer.calibration.splined.volume import (
     working_volume,
 )
 from slviewer.fringe.sequence import Axis
-from slviewer.pipeline.feedback import Progress, ignore_progress
+from slviewer.pipeline.feedback import Progress
 from slviewer.pipeline.simulate import TARGET
 from slviewer.simulation.plans import letter_plan
 from slviewer.simulation.rig import SimulatedRig
@@ -58,9 +58,7 @@ class PredictedErrors:
         }
 
 
-def prove_uncertainty(
-    scale: float = 0.5, *, poses: int = POSES, seed: int = 0, progress: Progress = ignore_progress
-) -> Proof:
+def prove_uncertainty(scale: float, seed: int, progress: Progress) -> Proof:
     """Calibrate rigs of different lenses and boards from rendered captures, and compare what each predicts of its
     errors with these. ``scale``: resolution of the camera, as a share of the Letter's.
 
@@ -69,9 +67,9 @@ def prove_uncertainty(
     rigs = {}
     for name, case, report in track(progress, {case.name: case for case in rig_cases(seed)}):
         rig = case.rig(scale)
-        plan = letter_plan(rig, Board.parse(TARGET), poses, case.shape)
+        plan = letter_plan(rig, Board.parse(TARGET), POSES, case.shape)
         rigs[name] = compare_with_truth(calibrate_rendered(rig, plan, report)[1], rig)
-    return judge_uncertainty(rigs, scale, poses)
+    return judge_uncertainty(rigs, scale, POSES)
 
 
 def judge_uncertainty(rigs: Mapping[str, PredictedErrors], scale: float, poses: int) -> Proof:

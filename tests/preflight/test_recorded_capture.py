@@ -16,7 +16,7 @@ from slviewer.devices.world import SimulatedWorld
 from slviewer.fringe.presets import complementary, gray, p18
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.pipeline.check_results import Preflight
-from slviewer.preflight.check_rig import check_capture
+from slviewer.preflight.check_rig import check_recorded_rig
 from slviewer.session.store import Session
 from slviewer.simulation.rig import letter
 
@@ -42,7 +42,7 @@ def frames_of(
 def checked(folder: Path, sequence: PatternSequence, stack: np.ndarray) -> Preflight:
     with Session.create(folder) as store:
         store.save_capture("part", "scan", sequence, stack, source="a test")
-    return check_capture(folder, "part")
+    return check_recorded_rig(folder, "part")
 
 
 def gained(stack: np.ndarray, gain: float | np.ndarray, offset: float = 0.0) -> np.ndarray:
