@@ -12,9 +12,8 @@ from typing import Annotated, Any, Literal
 import msgspec
 import numpy as np
 
-from slviewer.devices.opening import Openable
 from slviewer.devices.page_channel import ANSWER_S, Done, PageChannel, PageConnection
-from slviewer.devices.protocols import CameraSettings, Channel, check_channel, check_frame, check_size
+from slviewer.devices.protocols import CameraSettings, Channel, Openable, check_channel, check_frame, check_image_size
 from slviewer.errors import DeviceError
 
 FRAME_S = 10.0
@@ -147,7 +146,7 @@ class BrowserCamera(Openable):
         self._exposure_ms = CameraSettings(exposure_ms).exposure_ms
         self._page: PageConnection[Video] | None = None
         self._note = ""
-        known = page.page_state().size if size is None else check_size("camera", size, _MAX_SIDE_PX)
+        known = page.page_state().size if size is None else check_image_size("camera", size, _MAX_SIDE_PX)
         if known is None:
             raise DeviceError("the camera's size is unknown: open the camera page first, or give the size")
         self.size: tuple[int, int] = known
@@ -163,17 +162,12 @@ class BrowserCamera(Openable):
             )
         return tuple(f"{self.name}: {sentence}" for sentence in (unlocked, self._note) if sentence)
 
-    def open(self) -> None:
+    def _start(self) -> None:
         """Lock what is automatic. Raises DeviceError with a remedy where the page has no pictures of this size."""
-        super().open()
-        try:
-            self._pages.set_use(self.size)
-            page = self._pages.page()
-            self._lock(page, self._exposure_ms)
-            self._page = page
-        except BaseException:
-            self.close()
-            raise
+        self._pages.set_use(self.size)
+        page = self._pages.page()
+        self._lock(page, self._exposure_ms)
+        self._page = page
 
     def close(self) -> None:
         """Release the page, which unlocks its camera; nothing happens when it is not open."""

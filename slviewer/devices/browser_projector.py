@@ -10,9 +10,8 @@ from typing import Any
 
 import msgspec
 
-from slviewer.devices.opening import Openable
 from slviewer.devices.page_channel import ANSWER_S, PageChannel, PageConnection
-from slviewer.devices.protocols import check_index, check_level, check_sequence, check_size
+from slviewer.devices.protocols import Openable, check_image_size, check_index, check_level, check_sequence
 from slviewer.devices.screen import Screen, refusal
 from slviewer.errors import DeviceError
 from slviewer.fringe.patterns import profile
@@ -86,17 +85,12 @@ class BrowserProjector(Openable):
         self._page: PageConnection[Screen] | None = None  # that has what was sent
         self._changes = 0
 
-    def open(self) -> None:
+    def _start(self) -> None:
         """Show dark. Raises DeviceError with a remedy where the page cannot show patterns pixel by pixel."""
-        super().open()
-        try:
-            self._forget_loaded()
-            self._channel.set_pattern_size(self.size)
-            self._channel.page()
-            self.show_level(None)
-        except BaseException:
-            self.close()
-            raise
+        self._forget_loaded()
+        self._channel.set_pattern_size(self.size)
+        self._channel.page()
+        self.show_level(None)
 
     def close(self) -> None:
         """Release the page, which then shows its marker."""
@@ -154,7 +148,7 @@ def browser_projector(size: Sequence[int] | None = None, page: ProjectorChannel 
         raise DeviceError(
             "the browser projector's page is served by `slviewer wizard` and `slviewer capture`: use one of them"
         )
-    known = page.page_state().size if size is None else check_size("projector", size, _MAX_SIZE_PX)
+    known = page.page_state().size if size is None else check_image_size("projector", size, _MAX_SIZE_PX)
     if known is None:
         raise DeviceError("the projector's size is unknown: open the projector page first, or give the size")
     return BrowserProjector(page, known)

@@ -10,8 +10,7 @@ from slviewer.devices.drivers import Driver
 from slviewer.devices.genicam_features import Features, Trigger
 from slviewer.devices.gentl import ListedCamera, list_cameras
 from slviewer.devices.gentl_link import Image, Link, open_node_map
-from slviewer.devices.opening import Openable
-from slviewer.devices.protocols import CameraSettings, Channel, check_channel, check_frame, extract_channel
+from slviewer.devices.protocols import CameraSettings, Channel, Openable, check_channel, check_frame, extract_channel
 from slviewer.errors import DeviceError, InputError
 
 IN_FLIGHT = 2
@@ -66,23 +65,18 @@ class GenicamCamera(Openable):
         self._link: Link | None = None
         self._timeout_s = _ANSWER_TIMEOUT_S
 
-    def open(self) -> None:
+    def _start(self) -> None:
         """Claim the camera and start it. Raises DeviceError where it is gone, in use or was reconfigured."""
-        super().open()
-        try:
-            self._link = Link(self._camera)
-            features = self._get_features()
-            features.prepare(self.pixels, self._trigger, self.line)
-            if features.size() != self.size:
-                (width, height), (columns, rows) = features.size(), self.size
-                raise DeviceError(
-                    f"{self.name} has images of {width}x{height} px, no longer {columns}x{rows}: choose it anew"
-                )
-            self.apply(self._first)
-            self._link.start()
-        except BaseException:
-            self.close()
-            raise
+        self._link = Link(self._camera)
+        features = self._get_features()
+        features.prepare(self.pixels, self._trigger, self.line)
+        if features.size() != self.size:
+            (width, height), (columns, rows) = features.size(), self.size
+            raise DeviceError(
+                f"{self.name} has images of {width}x{height} px, no longer {columns}x{rows}: choose it anew"
+            )
+        self.apply(self._first)
+        self._link.start()
 
     def close(self) -> None:
         """Release the camera, in free-running mode."""

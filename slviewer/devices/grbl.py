@@ -14,8 +14,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 
 from slviewer.devices.drivers import Driver
-from slviewer.devices.opening import Openable
-from slviewer.devices.protocols import check_angle
+from slviewer.devices.protocols import Openable, check_angle
 from slviewer.errors import InputError, TurntableError
 
 Dialect = Literal["auto", "grbl", "marlin"]
@@ -128,31 +127,26 @@ class GcodeTurntable(Openable):
         self._unreadable = 0  # bytes that are no text, since it was opened
         self._is_marlin = False
 
-    def open(self) -> None:
+    def _start(self) -> None:
         """Open the port, and wait for the controller. Raises TurntableError where it does not answer or is locked."""
         import serial  # lazily: an optional package
 
-        super().open()
         try:
-            try:
-                self._serial = serial.Serial(
-                    self.port,
-                    self.baud,
-                    timeout=self.timing.poll_s / 2,
-                    write_timeout=self.reply_s,
-                    exclusive=True,
-                )
-            except (OSError, ValueError) as error:
-                raise TurntableError(
-                    f"{self.name} cannot be opened ({error}): plug it in, end other programs that use it, and check "
-                    "the port; `slviewer devices` lists those that are connected"
-                ) from error
-            self._buffer, self._unreadable = b"", 0
-            self._is_marlin = self._probe() == "marlin"
-            self.position_deg()  # raises where it is locked
-        except BaseException:
-            self.close()
-            raise
+            self._serial = serial.Serial(
+                self.port,
+                self.baud,
+                timeout=self.timing.poll_s / 2,
+                write_timeout=self.reply_s,
+                exclusive=True,
+            )
+        except (OSError, ValueError) as error:
+            raise TurntableError(
+                f"{self.name} cannot be opened ({error}): plug it in, end other programs that use it, and check "
+                "the port; `slviewer devices` lists those that are connected"
+            ) from error
+        self._buffer, self._unreadable = b"", 0
+        self._is_marlin = self._probe() == "marlin"
+        self.position_deg()  # raises where it is locked
 
     def close(self) -> None:
         """Close the port; a motion that was begun is stopped before that by `turn_to`."""

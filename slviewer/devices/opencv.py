@@ -22,8 +22,15 @@ from slviewer.devices.opencv_controls import (
 )
 from slviewer.devices.opencv_reader import TIMING, Reader, StreamTiming
 from slviewer.devices.opencv_source import connect_source, describe_source, list_webcams
-from slviewer.devices.opening import Openable
-from slviewer.devices.protocols import CameraSettings, Channel, check_channel, check_frame, check_size, extract_channel
+from slviewer.devices.protocols import (
+    CameraSettings,
+    Channel,
+    Openable,
+    check_channel,
+    check_frame,
+    check_image_size,
+    extract_channel,
+)
 from slviewer.errors import DeviceError, InputError
 
 SETTLING = 3
@@ -59,7 +66,7 @@ class OpenCVCamera(Openable):
 
     def __post_init__(self) -> None:
         source = self.source = _check_source(self.source)
-        wanted = None if self.size is None else check_size("camera", self.size)
+        wanted = None if self.size is None else check_image_size("camera", self.size)
         check_channel(self.channel)
         CameraSettings(self.exposure_ms)
         if not all(value is None or math.isfinite(value) for value in (self.gain, self.focus, self.white_balance)):
@@ -80,20 +87,15 @@ class OpenCVCamera(Openable):
         """Warnings about the settings, a sentence each."""
         return tuple(f"{self.name}: {sentence}" for sentence in self._notices.values() if sentence)
 
-    def open(self) -> None:
+    def _start(self) -> None:
         """Start reading. Raises DeviceError where the source does not answer, or its frames have another size."""
-        super().open()
-        try:
-            if self._reader is not None:
-                self._reader.join(self.timing.opening_s)  # it may hang in a call, the device still in its hands
-            self._reader = Reader(self.name, self._connect, self.timing)
-            self._next, self._read = self._check_size(self._reader.first()), 0
-            self._notices = {}
-            self._reader.do(self._prepare)
-            _IN_USE[self.source] = self
-        except BaseException:
-            self.close()
-            raise
+        if self._reader is not None:
+            self._reader.join(self.timing.opening_s)  # it may hang in a call, the device still in its hands
+        self._reader = Reader(self.name, self._connect, self.timing)
+        self._next, self._read = self._check_size(self._reader.first()), 0
+        self._notices = {}
+        self._reader.do(self._prepare)
+        _IN_USE[self.source] = self
 
     def close(self) -> None:
         """Release the source, if necessary once it returns from a blocking call."""

@@ -84,7 +84,7 @@ class ViserGate:
             case messages.FileTransferStartUpload():
                 button = self._require_input(message.source_component_uuid)
                 _check(isinstance(button, viser.GuiUploadButtonHandle))
-                return inside.encode_message(self._uploads.start(message))
+                return inside.pack_message(self._uploads.start(message))
             case messages.FileTransferPart():
                 self._uploads.part(message)
             case messages.ScenePointerMessage():

@@ -137,7 +137,7 @@ def decode_message(raw: bytes) -> Message | None:
         return None
 
 
-def encode_message(message: Message) -> bytes:
+def pack_message(message: Message) -> bytes:
     """The bytes in which a client sends this message."""
     return msgspec.msgpack.encode({"type": type(message).__name__, **vars(message)})
 

@@ -14,7 +14,7 @@ from slviewer.fringe.presets import AXES
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.simulation.concave import ConcaveScene
 from slviewer.simulation.film import NORMAL_QUANTILES, digitise, image_light, psf_taps
-from slviewer.simulation.light import OVERSAMPLING, blur_levels, blurred_profile, window
+from slviewer.simulation.light import blur_levels, blurred_profile, window
 from slviewer.simulation.rig import SimulatedRig
 from slviewer.simulation.scenes import Scene
 
@@ -131,7 +131,7 @@ class Renderer:
         out = np.empty((height, width), np.float32)
         image_light(
             maps.coordinates[varies or "x"], maps.level, illuminated, np.float32(lamp) * light.table, light.offset,
-            OVERSAMPLING, self._taps, stray, out,
+            self._taps, stray, out,
         )  # fmt: skip
         if isinstance(self.scene, ConcaveScene):
             indirect = self._indirect_light(varies or "x", (1 - rig.light.black) * light_levels)

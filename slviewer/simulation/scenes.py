@@ -36,11 +36,9 @@ class Scene(Protocol):
 
     def trace(self, rays: np.ndarray) -> Surface:
         """What the camera rays (h, w, 2) = (x/z, y/z) meet."""
-        ...
 
     def occluded(self, points: np.ndarray, source: np.ndarray) -> np.ndarray:
         """(n,) bool: the way from `points` (n, 3) on the surface to `source` (3,) is blocked."""
-        ...
 
 
 def directions_of(rays: np.ndarray) -> np.ndarray:
