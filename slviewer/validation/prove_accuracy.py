@@ -135,7 +135,7 @@ class RigFigures:
     @property
     def measured(self) -> float:
         """Mean share of the planes' pixels that the splined model measures."""
-        return fmean(plane.measured for plane in self.planes.values())
+        return float(np.mean([plane.measured for plane in self.planes.values()]))
 
     @property
     def largest_errors_mm(self) -> tuple[float, float]:

@@ -99,11 +99,11 @@ def _signed_distance(rig: SimulatedRig, scene: BoardScene) -> tuple[np.ndarray, 
         crossings = np.flatnonzero((row[:-1] < 0) != (row[1:] < 0))
         places = crossings + row[crossings] / (row[crossings] - row[crossings + 1])
         gaps = np.diff(places, prepend=-np.inf, append=np.inf) > 2 * _REACH_PX
-        for place, is_isolated in zip(places, gaps[:-1] & gaps[1:], strict=True):
+        for crossing, place, is_isolated in zip(crossings, places, gaps[:-1] & gaps[1:], strict=True):
             first, last = int(place) - _REACH_PX, int(place) + _REACH_PX + 2
             if is_isolated and first >= 0 and last <= width and (albedo[v, first:last] > 0).all():
                 distance[v, first:last] = np.arange(first, last) - place
-                side[v, first:last] = row[int(place) + 1] > 0
+                side[v, first:last] = row[crossing + 1] > 0
     return distance, side
 
 

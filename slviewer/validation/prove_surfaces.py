@@ -141,10 +141,10 @@ def _make_row(name: str, preset: str, errors: SequenceErrors) -> Row:
     return {
         "surface": name,
         "patterns": preset,
-        "RMS mm": round(errors.rms_mm, 3),
-        "with mask": round(errors.masked_rms_mm, 3),
+        "RMS mm": errors.rms_mm,
+        "with mask": errors.masked_rms_mm,
         ">5 sigma %": round(100 * errors.wrong, 2),
-        "of these masked %": round(100 * errors.caught, 1),
-        "gross masked %": round(100 * errors.gross_caught, 1),
+        "of these masked %": 100 * errors.caught,
+        "gross masked %": 100 * errors.gross_caught,
         "good masked %": round(100 * errors.lost, 2),
     }

@@ -80,7 +80,7 @@ def judge_uncertainty(rigs: Mapping[str, PredictedErrors], scale: float, poses: 
     table = [
         {
             "rig": row["rig"],
-            "supported %": round(100 * row["supported"], 1),
+            "supported %": 100 * row["supported"],
             "predicted um": round(1000 * row["predicted"], 1),
             "true um": round(1000 * row["true"], 1),
             "predicted / true": round(row["ratio"], 2),
