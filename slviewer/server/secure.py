@@ -23,6 +23,7 @@ from slviewer.server.downloads import Downloads
 from slviewer.server.gate import ViserGate
 from slviewer.server.limits import CONNECTIONS, Admissions, limit_log, raise_descriptor_limit
 from slviewer.server.uploads import UploadBudget
+from slviewer.server.viser_internals import ViserClient
 
 MESSAGE_LIMIT = 32 * 2**20
 """Bytes of one message from a browser; the largest is a picture that the server requested."""
@@ -102,10 +103,11 @@ class SafeServer:
 
         Raises OSError where the tokens come from a file that cannot be replaced; they are replaced here nevertheless.
         """
-        leaving = viser_internals.connection_of(self.viser, client_id)
+        client = ViserClient(self.viser, client_id)
+        leaving = client.connection
         self.access.renew()
         viser_internals.call_soon(self.viser, 0.0, self.admissions.close_all, leaving)
-        viser_internals.navigate(self.viser, client_id, f"/#{self.access.issue_one_time_token()}")
+        client.navigate(f"/#{self.access.issue_one_time_token()}")
         viser_internals.call_soon(self.viser, leaving_s, self.admissions.close_all, None, leaving)
         if self.serving.token_file is not None:
             save_tokens(self.serving.token_file, {role: grant.token for role, grant in self.access.grants.items()})
@@ -117,12 +119,12 @@ class SafeServer:
 
     def role(self, client_id: int) -> Role | None:
         """The role of a client of viser, "operate" or "watch"; None once it is disconnected."""
-        connection = viser_internals.connection_of(self.viser, client_id)
+        connection = ViserClient(self.viser, client_id).connection
         return None if connection is None else connection.role
 
     def origin_of(self, client_id: int) -> str | None:
         """The origin (scheme, host, port) of a client's page, which a proxy may serve; None once disconnected."""
-        connection = viser_internals.connection_of(self.viser, client_id)
+        connection = ViserClient(self.viser, client_id).connection
         return None if connection is None else connection.request.headers["Origin"]
 
     def stop(self) -> None:
