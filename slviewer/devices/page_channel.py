@@ -46,27 +46,25 @@ class PageState:
     size: tuple[int, int] | None = None
 
 
+@dataclass(eq=False)
 class PageConnection(Generic[Facts]):
-    """One connection of a page. The device's thread sends requests, the server's stores the answers."""
+    """One connection of a page. The device's thread sends requests, the server's stores the answers.
 
-    def __init__(
-        self,
-        condition: threading.Condition,
-        name: str,
-        window: str,
-        facts: Facts,
-        send: Send,
-        answer_s: float = ANSWER_S,
-    ) -> None:
-        self.window, self.facts = window, facts
-        self.send = send
-        self.answer_s = answer_s
-        self.changes = 0  # of what it reported since it connected
-        self.refused, self.gone = "", ""
-        self.published: Any = None
-        self._condition, self._name = condition, name
-        self._number = 0
-        self._answer: tuple[Done, bytes] | None = None
+    ``changes`` of what it reported since it connected; ``refused``, ``gone``: why it cannot be the device, or is lost.
+    """
+
+    condition: threading.Condition
+    name: str
+    window: str
+    facts: Facts
+    send: Send
+    answer_s: float = ANSWER_S
+    changes: int = 0
+    refused: str = ""
+    gone: str = ""
+    published: Any = None
+    _number: int = 0
+    _answer: tuple[Done, bytes] | None = None
 
     def request(self, op: str, payload: bytes = b"", timeout_s: float | None = None, **fields: Any) -> bytes:
         """Send a request, wait until the page reports it done, and return what came with the answer.
@@ -74,7 +72,7 @@ class PageConnection(Generic[Facts]):
         Raises DeviceError within `timeout_s`, None: within `answer_s`.
         """
         timeout_s = self.answer_s if timeout_s is None else timeout_s
-        with self._condition:
+        with self.condition:
             self._number += 1
             self.check()
             self.send(encode_message({"op": op, "number": self._number, **fields}, payload))
@@ -84,14 +82,14 @@ class PageConnection(Generic[Facts]):
                 remaining_s = end - time.monotonic()
                 if remaining_s <= 0:
                     raise DeviceError(
-                        f"{self._name} did not answer within {timeout_s:g} s: look whether its window is covered, "
+                        f"{self.name} did not answer within {timeout_s:g} s: look whether its window is covered, "
                         "its computer asleep, or the network down"
                     )
-                self._condition.wait(remaining_s)
+                self.condition.wait(remaining_s)
             done, content = self._answer
             self._answer = None
             if done.why:
-                raise DeviceError(f"{self._name} failed, {done.why}: reload it")
+                raise DeviceError(f"{self.name} failed, {done.why}: reload it")
             return content
 
     def check(self) -> None:

@@ -40,26 +40,22 @@ class DevicePage:
     handler: Callable[[ServerConnection], Awaitable[None]]
 
 
+@dataclass(eq=False)
 class AuthMiddleware:
-    """Authorises and answers a server's requests: viser's page, our own pages and files, and WebSockets."""
+    """Authorises and answers a server's requests: viser's page, our own pages and files, and WebSockets.
 
-    def __init__(
-        self,
-        access: Access,
-        admissions: Admissions,
-        device_pages: Mapping[Role, DevicePage],
-        downloads: Downloads,
-        strict_transport: bool = False,
-    ) -> None:
-        """`device_pages`: those that are served, which may change. `strict_transport`: browsers are told to use this
-        host encrypted from now on.
-        """
-        self._access = access
-        self._admissions = admissions
-        self._device_pages = device_pages
-        self._downloads = downloads
+    ``device_pages``: those that are served, which may change. ``strict_transport``: browsers are told to use this host
+    encrypted from now on.
+    """
+
+    access: Access
+    admissions: Admissions
+    device_pages: Mapping[Role, DevicePage]
+    downloads: Downloads
+    strict_transport: bool = False
+
+    def __post_init__(self) -> None:
         self._viser_page = client_page()
-        self._strict_transport = strict_transport
         self._login_page = resources.files("slviewer.server").joinpath("login.html").read_bytes()
         self._help = HelpPages()
 
@@ -67,20 +63,20 @@ class AuthMiddleware:
         """Return the response to a request, hardened; None to open a WebSocket."""
         host = ""
         try:
-            host = self._access.host(request.headers, connection.transport.get_extra_info("sockname")[0])
+            host = self.access.host(request.headers, connection.transport.get_extra_info("sockname")[0])
             response = await self._answer(connection, request, host)
         except Refusal as refusal:
             response = self._refuse(refusal, request, host)
         except Exception:
             logger.exception("a request failed")
             response = respond(HTTPStatus.INTERNAL_SERVER_ERROR, "slviewer failed: see its log.\n")
-        if response is not None and self._strict_transport:
+        if response is not None and self.strict_transport:
             response.headers["Strict-Transport-Security"] = "max-age=86400"
         return response
 
     async def _answer(self, connection: Connection, request: Request, host: str) -> Response | None:
         """Return the response to an authorised request, None to open a WebSocket; raises Refusal otherwise."""
-        headers, access = request.headers, self._access
+        headers, access = request.headers, self.access
         websocket = any(value.lower() == "websocket" for value in headers.get_all("Upgrade"))
         access.check_origin(headers, host, websocket)
         path, _, _ = request.path.partition("?")
@@ -91,16 +87,16 @@ class AuthMiddleware:
         if not websocket and (response := self._answer_anyone(connection, request, path, host)) is not None:
             return response
         grant, rest = access.authorise(path, headers)
-        self._admissions.admit(connection, grant.role)
+        self.admissions.admit(connection, grant.role)
         if websocket:
             self._check_websocket(request, grant, rest)
             return None
         if rest == "favicon.ico":  # asked for by the page of "/" too, which so learns whether its cookie is valid
             return respond(HTTPStatus.NO_CONTENT)
         if grant.role in DEVICE_PATHS.values():
-            if rest or grant.role not in self._device_pages:
+            if rest or grant.role not in self.device_pages:
                 raise Refusal(HTTPStatus.NOT_FOUND, "There is no such page here.")
-            html = self._device_pages[grant.role].html
+            html = self.device_pages[grant.role].html
             return _respond_page(html, page_policy(html, host))
         if not rest:
             return _respond_page(self._viser_page, viser_policy(_SCRIPTS, host))
@@ -108,7 +104,7 @@ class AuthMiddleware:
             return await self._download(connection, rest)
         if rest.startswith(HELP_PREFIX):
             return self._show_help(rest.removeprefix(HELP_PREFIX))
-        if grant.role == "operate" and DEVICE_PATHS.get(rest) in self._device_pages:
+        if grant.role == "operate" and DEVICE_PATHS.get(rest) in self.device_pages:
             return self._lead_to(access.grants[DEVICE_PATHS[rest]], request)
         raise Refusal(HTTPStatus.NOT_FOUND, "There is nothing here for this link.")
 
@@ -134,7 +130,7 @@ class AuthMiddleware:
     def _check_websocket(self, request: Request, grant: Grant, rest: str) -> None:
         """Raise Refusal unless the role has a WebSocket at the rest of this path."""
         is_device = grant.role in DEVICE_PATHS.values()
-        if rest or (is_device and grant.role not in self._device_pages):
+        if rest or (is_device and grant.role not in self.device_pages):
             raise Refusal(HTTPStatus.NOT_FOUND, "There is nothing here.")
         if not is_device and request.headers.get_all("Sec-WebSocket-Protocol") != [SUBPROTOCOL]:
             raise Refusal(HTTPStatus.BAD_REQUEST, "This page is of another version: reload it.")
@@ -145,16 +141,16 @@ class AuthMiddleware:
         if scheme.lower() != "bearer":
             raise Refusal(HTTPStatus.UNAUTHORIZED, "There is no token: open the link that slviewer printed.")
         peer = connection.transport.get_extra_info("peername")
-        grant = self._access.exchange(token.strip(), address_group(peer[0]))
+        grant = self.access.exchange(token.strip(), address_group(peer[0]))
         response = respond(HTTPStatus.OK, json.dumps({"path": f"{grant.path}/"}), "application/json")
-        response.headers["Set-Cookie"] = grant.set_cookie(self._access.is_encrypted(request.headers))
+        response.headers["Set-Cookie"] = grant.set_cookie(self.access.is_encrypted(request.headers))
         return response
 
     def _lead_to(self, grant: Grant, request: Request) -> Response:
         """Redirect the operator's browser to the page of another role, with its cookie."""
         response = respond(HTTPStatus.SEE_OTHER)
         response.headers["Location"] = f"{grant.path}/"
-        response.headers["Set-Cookie"] = grant.set_cookie(self._access.is_encrypted(request.headers))
+        response.headers["Set-Cookie"] = grant.set_cookie(self.access.is_encrypted(request.headers))
         return response
 
     def _refuse(self, refusal: Refusal, request: Request, host: str) -> Response:
@@ -166,7 +162,7 @@ class AuthMiddleware:
 
     async def _download(self, connection: Connection, path: str) -> Response:
         """Stream an offered file; raises Refusal where it is no longer offered."""
-        opened = self._downloads.open(path)
+        opened = self.downloads.open(path)
         if opened is None:
             raise Refusal(HTTPStatus.NOT_FOUND, "This file is no longer offered: request it again in slviewer.")
         headers, file = opened

@@ -11,14 +11,14 @@ SMALLEST_PART = 4096
 """Bytes; viser's page sends half a megabyte at a time. Smaller parts would cost more memory than they carry."""
 
 
+@dataclass
 class UploadBudget:
-    """How many bytes of unfinished uploads the server holds for all clients together (viser keeps them in memory)."""
+    """How many bytes of unfinished uploads the server holds for all clients together (viser keeps them in memory), and
+    the ``names`` of the transfers under way: viser keeps them in one place for all clients."""
 
-    def __init__(self, limit: int) -> None:
-        self.limit = limit
-        self.used = 0
-        self.names: set[str] = set()
-        """Of the transfers under way: viser keeps them in one place for all clients."""
+    limit: int
+    used: int = 0
+    names: set[str] = field(default_factory=set)
 
 
 @dataclass
