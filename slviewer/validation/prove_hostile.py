@@ -168,9 +168,9 @@ class _Trial:
         self._bench = bench
         self._session = bench.folder / "sound"
         report = CaseReport()
-        bench.store(self._session, {name: bench.capture(name)[0] for name in bench.scenes}, report)
+        bench.store(self._session, {name: bench.capture(name)[0] for name in bench.targets}, report)
         bench.calibrate(self._session, report)
-        measured = [bench.measure(self._session, name, bench.capture(name)[1:], report) for name in SCANS]
+        measured = self._measure_scans(self._session, report)
         self._gauge = fit_gauge(measured)
         self._floor = score(measured, self._gauge)
 
@@ -179,8 +179,10 @@ class _Trial:
         start, report = perf_counter(), CaseReport()
         measured: Sequence[MeasuredScan] = ()
         try:
-            measure = self._measure_faulty_scans if direction == "scan" else self._measure_after_faulty_calibration
-            measured = measure(FAULTS[name], severity, report)
+            if direction == "scan":
+                measured = self._measure_scans(self._session, report, FAULTS[name], severity)
+            else:
+                measured = self._measure_after_faulty_calibration(FAULTS[name], severity, report)
         except Exception as error:  # the other cases still have to run
             report.error = error
         gauge = self._gauge if direction == "scan" or not measured else fit_gauge(measured)
@@ -192,11 +194,13 @@ class _Trial:
             name, severity, direction, outcome, outcome in PASSED, figures, self._floor, named, tuple(messages), seconds
         )
 
-    def _measure_faulty_scans(self, fault: Fault, severity: Severity, report: CaseReport) -> Sequence[MeasuredScan]:
-        """Measure all scans, captured with the fault, with the clean calibration."""
+    def _measure_scans(
+        self, session: Path, report: CaseReport, fault: Fault | None = None, severity: Severity = "mild"
+    ) -> list[MeasuredScan]:
+        """Measure all scans, captured with the fault if there is one, with the calibration of a session."""
         shots = {name: self._bench.capture(name, fault, severity) for name in SCANS}
-        self._bench.store(self._session, {name: shot[0] for name, shot in shots.items()}, report)
-        return [self._bench.measure(self._session, name, shot[1:], report) for name, shot in shots.items()]
+        self._bench.store(session, {name: shot[0] for name, shot in shots.items()}, report)
+        return [self._bench.measure(session, name, shot[1:], report) for name, shot in shots.items()]
 
     def _measure_after_faulty_calibration(
         self, fault: Fault, severity: Severity, report: CaseReport
@@ -208,8 +212,7 @@ class _Trial:
         frames = {n: bench.capture(n, *((fault, severity) if n in struck else ()))[0] for n in bench.targets}
         bench.store(session, frames, report)
         bench.calibrate(session, report)
-        bench.store(session, {name: bench.capture(name)[0] for name in SCANS}, report)
-        return [bench.measure(session, name, bench.capture(name)[1:], report) for name in SCANS]
+        return self._measure_scans(session, report)
 
 
 def judge_case(
