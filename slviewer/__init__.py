@@ -123,13 +123,13 @@ _EXPORTS = {
 """{public name: module}, or module:name where it has another name there, or module:* for the module itself."""
 
 __all__ = [
-    "Board", "CalibrationResult", "Cloud", "Frame", "Measurement", "PatternSequence", "PhaseMap", "Quantity",
-    "Session", "SlviewerError", "Verification",
-    "align", "align_clouds", "calibrate", "calibrate_frames", "check_description", "complementary", "datasets",
-    "decode", "detect_board", "draw_error_maps", "evaluate_plane", "evaluate_sphere", "fuse_clouds", "gray",
+    "Board", "CalibrationResult", "Cloud", "Frame", "Measurement", "PatternSequence", "PhaseMap",
+    "Quantity", "Session", "SlviewerError", "Verification", "align", "align_clouds", "calibrate",
+    "calibrate_frames", "check_description", "complementary", "datasets", "decode", "detect_board",
+    "draw_error_maps", "evaluate_plane", "evaluate_sphere", "fuse_clouds", "gray",
     "import_captures", "load_arrays", "load_calibration", "measure", "merge", "mesh", "mesh_cloud",
-    "micro", "multifrequency", "p18", "plugins", "read_captures", "read_ply", "reconstruct", "reconstruct_cloud", "save_calibration", "texture", "verify",
-    "write_ply",
+    "micro", "multifrequency", "p18", "plugins", "read_captures", "read_ply", "reconstruct",
+    "reconstruct_cloud", "save_calibration", "texture", "verify", "write_ply",
 ]  # fmt: skip
 
 

@@ -13,10 +13,10 @@ The ``check_...`` functions test one as slviewer uses it, for the tests of its p
 """
 
 from slviewer.devices.drivers import Driver
-from slviewer.devices.opening import Openable
 from slviewer.devices.protocols import (
     Camera,
     CameraSettings,
+    Openable,
     Projector,
     Rig,
     Turntable,

@@ -18,8 +18,8 @@ from slviewer.geometry.lens import Lens
 from slviewer.geometry.rig import StereoRig
 from slviewer.geometry.rigid import Floats, move_points, transform_from_rvec
 from slviewer.geometry.triangulation import depth_per_px, points_from_depth, triangulate
-from slviewer.records.plain import from_plain, to_plain
 from slviewer.geometry.vectors import finite_rows, lengths, rms_length
+from slviewer.records.plain import from_plain, to_plain
 
 MIN_FEATURES = 12
 MAX_FOCAL_SIGMA = 0.05

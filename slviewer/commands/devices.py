@@ -57,13 +57,13 @@ def run_turn(turn: Callable[..., Any], arguments: dict[str, Any]) -> None:
 
 def run_preflight(check_rig: Callable[..., Any], arguments: dict[str, Any]) -> None:
     """Check a rig, or a recorded capture where --capture names one, and raise an error where something is bad."""
-    from slviewer.preflight.check_rig import check_capture
+    from slviewer.preflight.check_rig import check_recorded_rig
 
     recorded, json_file = arguments.pop("capture"), arguments.pop("json")
     if (arguments["rig"] is None) == (recorded is None):
         raise UsageError("give --rig to check a rig, or --capture SESSION NAME to check the frames of a capture")
     if recorded is not None:
-        checked = call(check_capture, session=recorded[0], capture=recorded[1])
+        checked = call(check_recorded_rig, session=recorded[0], capture=recorded[1])
     else:
         with _serve_pages(arguments) as set_up:
             checked = call(check_rig, set_up=set_up, **arguments)

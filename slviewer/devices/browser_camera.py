@@ -7,15 +7,14 @@ far as the browser lets it; what stays automatic is reported in `notes`.
 
 import struct
 from collections.abc import Sequence
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
 
-from slviewer.devices.opening import Openable
 from slviewer.devices.page_channel import ANSWER_S, Done, PageChannel, PageConnection
-from slviewer.devices.protocols import CameraSettings, Channel, check_frame
-from slviewer.errors import DeviceError, InputError
+from slviewer.devices.protocols import CameraSettings, Channel, Openable, check_channel, check_frame, check_image_size
+from slviewer.errors import DeviceError
 
 FRAME_S = 10.0
 """How long a picture may take, from the request until it has arrived here."""
@@ -55,23 +54,24 @@ class Video(msgspec.Struct, frozen=True):
     visible: bool
 
 
-class Hello(msgspec.Struct, tag_field="op", tag="hello"):
-    """The page's first message; `window` is the same after a reload, `take`: it requests to be the camera."""
+class CameraHello(msgspec.Struct, tag_field="op", tag="hello"):
+    """The first message of the camera page."""
 
     window: str
     take: bool
-    video: Video
+    facts: Video = msgspec.field(name="video")
 
 
-class Report(msgspec.Struct, tag_field="op", tag="video"):
+class CameraReport(msgspec.Struct, tag_field="op", tag="video"):
     """Message of the page that its camera has changed."""
 
-    video: Video
+    facts: Video = msgspec.field(name="video")
 
 
 class CameraChannel(PageChannel[Video]):
     """Connects a camera to its page."""
 
+    hello, report = CameraHello, CameraReport
     name = "the camera page"
     remedy = "open the camera's link on the phone or laptop whose camera is used"
 
@@ -86,14 +86,9 @@ class CameraChannel(PageChannel[Video]):
             self._frame_size = size
             self._publish_state()
 
-    def _read_hello(self, message: str | bytes) -> tuple[str, bool, Video]:
-        hello: Hello = self._decode(message, Hello)
-        return hello.window, hello.take, hello.video
-
     def _read_message(self, message: str | bytes) -> tuple[Done, bytes] | Video:
         if isinstance(message, str):
-            incoming = self._decode(message, Report | Done)
-            return (incoming, b"") if isinstance(incoming, Done) else incoming.video
+            return super()._read_message(message)
         start = 4 + struct.unpack("<I", message[:4])[0] if len(message) >= 4 else 4
         return self._decode(message[4:start], Done), message[start:]
 
@@ -140,12 +135,7 @@ class BrowserCamera(Openable):
 
         Raises DeviceError without a `page`, and where `size` is None and no page is ready.
         """
-        if channel not in get_args(Channel):
-            raise InputError(f"no channel is called {channel!r}: use one of {', '.join(get_args(Channel))}")
-        if size is not None and (
-            len(size) != 2 or not all(isinstance(side, int) and 0 < side <= _MAX_SIDE_PX for side in size)
-        ):
-            raise InputError(f"{size!r} is no size of a camera: give its width and height in px, such as [1920, 1080]")
+        check_channel(channel)
         if page is None:
             raise DeviceError(
                 "the browser camera's page is served by `slviewer wizard` and `slviewer capture`: use one of them"
@@ -156,35 +146,28 @@ class BrowserCamera(Openable):
         self._exposure_ms = CameraSettings(exposure_ms).exposure_ms
         self._page: PageConnection[Video] | None = None
         self._note = ""
-        if size is None:
-            size = page.page_state().size
-            if size is None:
-                raise DeviceError("the camera's size is unknown: open the camera page first, or give the size")
-        self.size: tuple[int, int] = (size[0], size[1])
+        known = page.page_state().size if size is None else check_image_size("camera", size, _MAX_SIDE_PX)
+        if known is None:
+            raise DeviceError("the camera's size is unknown: open the camera page first, or give the size")
+        self.size: tuple[int, int] = known
 
     @property
     def notes(self) -> tuple[str, ...]:
         """Warnings about the settings, a sentence each."""
-        page, found = self._page, []
+        page, unlocked = self._page, ""
         if page is not None and page.facts.automatic:
-            automatic = " and ".join(page.facts.automatic)
-            found.append(
-                f"its browser does not lock {automatic}: nothing may move or change its brightness during a capture; "
-                "Chrome on Android locks most"
+            unlocked = (
+                f"its browser does not lock {' and '.join(page.facts.automatic)}: nothing may move or change its "
+                "brightness during a capture; Chrome on Android locks most"
             )
-        return tuple(f"{self.name}: {sentence}" for sentence in (*found, self._note) if sentence)
+        return tuple(f"{self.name}: {sentence}" for sentence in (unlocked, self._note) if sentence)
 
-    def open(self) -> None:
+    def _start(self) -> None:
         """Lock what is automatic. Raises DeviceError with a remedy where the page has no pictures of this size."""
-        super().open()
-        try:
-            self._pages.set_use(self.size)
-            page = self._pages.page()
-            self._lock(page, self._exposure_ms)
-            self._page = page
-        except BaseException:
-            self.close()
-            raise
+        self._pages.set_use(self.size)
+        page = self._pages.page()
+        self._lock(page, self._exposure_ms)
+        self._page = page
 
     def close(self) -> None:
         """Release the page, which unlocks its camera; nothing happens when it is not open."""

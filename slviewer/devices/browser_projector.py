@@ -10,34 +10,34 @@ from typing import Any
 
 import msgspec
 
-from slviewer.devices.opening import Openable
-from slviewer.devices.page_channel import ANSWER_S, Done, PageChannel, PageConnection
-from slviewer.devices.protocols import check_index, check_level, check_sequence
+from slviewer.devices.page_channel import ANSWER_S, PageChannel, PageConnection
+from slviewer.devices.protocols import Openable, check_image_size, check_index, check_level, check_sequence
 from slviewer.devices.screen import Screen, refusal
-from slviewer.errors import DeviceError, InputError
+from slviewer.errors import DeviceError
 from slviewer.fringe.patterns import profile
 from slviewer.fringe.sequence import PatternSequence
 
 _MAX_SIZE_PX = 16384
 
 
-class Hello(msgspec.Struct, tag_field="op", tag="hello"):
-    """The page's first message; `window` is the same after a reload, `take`: it requests to be the projector."""
+class ProjectorHello(msgspec.Struct, tag_field="op", tag="hello"):
+    """The first message of the projector page."""
 
     window: str
     take: bool
-    screen: Screen
+    facts: Screen = msgspec.field(name="screen")
 
 
-class Report(msgspec.Struct, tag_field="op", tag="screen"):
+class ProjectorReport(msgspec.Struct, tag_field="op", tag="screen"):
     """Message of the page that its screen has changed."""
 
-    screen: Screen
+    facts: Screen = msgspec.field(name="screen")
 
 
 class ProjectorChannel(PageChannel[Screen]):
     """Connects a projector to its page."""
 
+    hello, report = ProjectorHello, ProjectorReport
     name = "the projector page"
     remedy = "open the projector's link on the projector's screen"
 
@@ -57,14 +57,6 @@ class ProjectorChannel(PageChannel[Screen]):
         with self._condition:
             self._light = grey
             self._publish_state()
-
-    def _read_hello(self, message: str | bytes) -> tuple[str, bool, Screen]:
-        hello: Hello = self._decode(message, Hello)
-        return hello.window, hello.take, hello.screen
-
-    def _read_message(self, message: str | bytes) -> tuple[Done, bytes] | Screen:
-        incoming = self._decode(message, Report | Done)
-        return (incoming, b"") if isinstance(incoming, Done) else incoming.screen
 
     def _refuse(self, facts: Screen) -> str:
         return refusal(facts, self._pattern_size)
@@ -93,17 +85,12 @@ class BrowserProjector(Openable):
         self._page: PageConnection[Screen] | None = None  # that has what was sent
         self._changes = 0
 
-    def open(self) -> None:
+    def _start(self) -> None:
         """Show dark. Raises DeviceError with a remedy where the page cannot show patterns pixel by pixel."""
-        super().open()
-        try:
-            self._forget_loaded()
-            self._channel.set_pattern_size(self.size)
-            self._channel.page()
-            self.show_level(None)
-        except BaseException:
-            self.close()
-            raise
+        self._forget_loaded()
+        self._channel.set_pattern_size(self.size)
+        self._channel.page()
+        self.show_level(None)
 
     def close(self) -> None:
         """Release the page, which then shows its marker."""
@@ -161,11 +148,7 @@ def browser_projector(size: Sequence[int] | None = None, page: ProjectorChannel 
         raise DeviceError(
             "the browser projector's page is served by `slviewer wizard` and `slviewer capture`: use one of them"
         )
-    if size is None:
-        page_size = page.page_state().size
-        if page_size is None:
-            raise DeviceError("the projector's size is unknown: open the projector page first, or give the size")
-        return BrowserProjector(page, page_size)
-    if len(size) != 2 or not all(isinstance(side, int) and 0 < side <= _MAX_SIZE_PX for side in size):
-        raise InputError(f"{size!r} is not a projector size: give its width and height in px, such as [1920, 1080]")
-    return BrowserProjector(page, (size[0], size[1]))
+    known = page.page_state().size if size is None else check_image_size("projector", size, _MAX_SIZE_PX)
+    if known is None:
+        raise DeviceError("the projector's size is unknown: open the projector page first, or give the size")
+    return BrowserProjector(page, known)

@@ -15,7 +15,7 @@ MAX_EXPOSURES = 8
 """With more, the scene would have to be still for too long."""
 
 
-def capture(
+def capture_frames(
     rig: Rig,
     sequence: PatternSequence,
     out: np.ndarray | None = None,
@@ -98,13 +98,13 @@ def capture_with_texture(
 ) -> CapturedFrames:
     """Capture `sequence`, in each of two or more `exposures_ms` if they are given, and then a colour texture.
 
-    `out` is (k n, h, w) where it is given, and `progress(done, k n)` as in `capture`. The camera's settings are as
-    before when this returns or raises. Raises InputError for invalid exposures, DeviceError for a camera that
-    cannot be set to them, and whatever `capture` raises.
+    `out` is (k n, h, w) where it is given, and `progress(done, k n)` as in `capture_frames`. The camera's settings are
+    as before when this returns or raises. Raises InputError for invalid exposures, DeviceError for a camera that
+    cannot be set to them, and whatever `capture_frames` raises.
     """
     if not exposures_ms:
-        frames = capture(rig, sequence, out, progress)
-        return CapturedFrames(frames, _read_settings(rig), (), _try_capture_texture(rig))
+        frames = capture_frames(rig, sequence, out, progress)
+        return CapturedFrames(frames, _read_settings(rig), (), _try_capture_colour(rig))
     wanted = check_exposures(exposures_ms)
     n = len(sequence.frames)
     out = _allocate(rig, n * len(wanted), out)
@@ -123,7 +123,7 @@ def capture_with_texture(
     finally:
         with contextlib.suppress(DeviceError), report_driver_faults(rig.camera):  # a lost device raises its own error
             rig.camera.apply(before)
-    return CapturedFrames(out, _read_settings(rig), tuple(applied_ms), _try_capture_texture(rig))
+    return CapturedFrames(out, _read_settings(rig), tuple(applied_ms), _try_capture_colour(rig))
 
 
 def check_exposures(exposures_ms: Sequence[float]) -> list[float]:
@@ -136,10 +136,10 @@ def check_exposures(exposures_ms: Sequence[float]) -> list[float]:
     return wanted
 
 
-def _try_capture_texture(rig: Rig) -> np.ndarray | None:
+def _try_capture_colour(rig: Rig) -> np.ndarray | None:
     """Capture the colour texture (h, w, 3); None also on a DeviceError: the frames are complete without it."""
     with report_driver_faults(rig.camera), contextlib.suppress(DeviceError):
-        return capture_texture(rig)
+        return capture_colour(rig)
     return None
 
 
@@ -165,7 +165,7 @@ def _offset_progress(
     return None if progress is None else lambda done, _: progress(before + done, frames)
 
 
-def capture_texture(rig: Rig) -> np.ndarray | None:
+def capture_colour(rig: Rig) -> np.ndarray | None:
     """Capture (h, w, 3) RGB of the scene under white light; None where the rig's camera sees no colour."""
     if not isinstance(rig.camera, ColourCamera):
         return None

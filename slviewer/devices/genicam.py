@@ -2,7 +2,7 @@
 
 import contextlib
 from collections.abc import Iterator
-from typing import Any, get_args
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -10,9 +10,7 @@ from slviewer.devices.drivers import Driver
 from slviewer.devices.genicam_features import Features, Trigger
 from slviewer.devices.gentl import ListedCamera, list_cameras
 from slviewer.devices.gentl_link import Image, Link, open_node_map
-from slviewer.devices.opening import Openable
-from slviewer.devices.pixel_formats import PixelFormat
-from slviewer.devices.protocols import Camera, CameraSettings, Channel, check_frame, extract_channel
+from slviewer.devices.protocols import CameraSettings, Channel, Openable, check_channel, check_frame, extract_channel
 from slviewer.errors import DeviceError, InputError
 
 IN_FLIGHT = 2
@@ -22,48 +20,63 @@ one that is being exposed, and the one before, which is being read out and sent.
 _ANSWER_TIMEOUT_S = 2.0
 
 
+@dataclass(eq=False)
 class GenicamCamera(Openable):
-    """A camera that delivers grey levels unprocessed: uint8, or uint16 with its 10 or 12 bits at the bottom.
+    """The connected camera of that serial number or model, or the only one there is: it delivers grey levels
+    unprocessed, uint8, or uint16 with its 10 or 12 bits at the bottom.
 
     With a software trigger each grab starts its own exposure. Of a camera that runs free, or by a line whose pulses
     repeat (a projector's frame clock), buffers are discarded until one comes whose exposure began after the call. A
     frame that is late or incomplete is a DeviceError, and never mistaken for the next: the stream is restarted after
     it.
+
+    `producer` is the .cti file of its maker's software, None: all that are installed. `exposure_ms` and `gain` are set
+    when it is opened, None: unchanged. `pixel_format` None: the deepest mono of up to 12 bits that comes
+    unpacked; of a colour camera its colours, of which `grab` decodes the `channel`, and `grab_colour` all three.
+    `trigger` "software" (where it has one), "hardware" with the name of its `line`, or "free". Raises InputError for
+    what the camera has not, or where several fit; DeviceError where none is connected.
     """
 
-    def __init__(
-        self,
-        camera: ListedCamera,
-        size: tuple[int, int],
-        pixels: PixelFormat,
-        trigger: Trigger,
-        line: str | None,
-        first: CameraSettings,
-    ) -> None:
-        super().__init__(f"the camera {camera}")
-        self.size, self.dtype, self.pixels = size, pixels.dtype, pixels
-        self.full_scale = 2**pixels.bits - 1
-        self._camera, self._trigger, self._line, self._first = camera, trigger, line, first
+    producer: str | None = None
+    serial: str | int | None = None
+    model: str | None = None
+    exposure_ms: float | None = None
+    gain: float | None = None
+    pixel_format: str | None = None
+    channel: Channel = "green"
+    trigger: Trigger | None = None
+    line: str | None = None
+
+    def __post_init__(self) -> None:
+        check_channel(self.channel)
+        serial = None if self.serial is None else str(self.serial)
+        self._camera = _choose_camera(list_cameras(self.producer), serial, self.model)
+        super().__init__(f"the camera {self._camera}")
+        self._first = CameraSettings(self.exposure_ms, self.gain)
+        with open_node_map(self._camera) as node_map:
+            features = Features(node_map, self.name)
+            self.pixels = features.choose_format(self.pixel_format)
+            self._trigger = features.choose_trigger(self.trigger, self.line)
+            features.check_settings(self._first)
+            self.size = features.size()
+        self.dtype, self.full_scale = self.pixels.dtype, 2**self.pixels.bits - 1
+        if self.pixels.colour:
+            self.grab_colour = self._grab_colour  # which makes it a `ColourCamera`
         self._link: Link | None = None
         self._timeout_s = _ANSWER_TIMEOUT_S
 
-    def open(self) -> None:
+    def _start(self) -> None:
         """Claim the camera and start it. Raises DeviceError where it is gone, in use or was reconfigured."""
-        super().open()
-        try:
-            self._link = Link(self._camera)
-            features = self._get_features()
-            features.prepare(self.pixels, self._trigger, self._line)
-            if features.size() != self.size:
-                (width, height), (columns, rows) = features.size(), self.size
-                raise DeviceError(
-                    f"{self.name} has images of {width}x{height} px, no longer {columns}x{rows}: choose it anew"
-                )
-            self.apply(self._first)
-            self._link.start()
-        except BaseException:
-            self.close()
-            raise
+        self._link = Link(self._camera)
+        features = self._get_features()
+        features.prepare(self.pixels, self._trigger, self.line)
+        if features.size() != self.size:
+            (width, height), (columns, rows) = features.size(), self.size
+            raise DeviceError(
+                f"{self.name} has images of {width}x{height} px, no longer {columns}x{rows}: choose it anew"
+            )
+        self.apply(self._first)
+        self._link.start()
 
     def close(self) -> None:
         """Release the camera, in free-running mode."""
@@ -80,7 +93,20 @@ class GenicamCamera(Openable):
         self.check_open()
         check_frame(self, out)
         with self._grab_fresh() as image:
-            self.pixels.unpack(image.data, out, image.padding)
+            if self.pixels.colour:
+                extract_channel(self._convert_rgb(image), self.channel, out)
+            else:
+                self.pixels.unpack(image.data, out, image.padding)
+
+    def _grab_colour(self) -> np.ndarray:
+        """Grab a frame whose exposure began after the call, (h, w, 3) RGB."""
+        self.check_open()
+        with self._grab_fresh() as image:
+            return np.array(self._convert_rgb(image))
+
+    def _convert_rgb(self, image: Image) -> np.ndarray:
+        """Convert the bytes of an image to (h, w, 3) RGB."""
+        return self.pixels.rgb(self.pixels.view_samples(image.data, image.size, image.padding))
 
     def settings(self) -> CameraSettings:
         """Read the current settings; None for those that the camera lacks, and for a gain in device-specific steps."""
@@ -124,62 +150,6 @@ class GenicamCamera(Openable):
         return Features(self._link.node_map, self.name)
 
 
-class GenicamColourCamera(GenicamCamera):
-    """A colour camera: `grab` returns one channel, `grab_colour` all three."""
-
-    def __init__(self, *what: Any, channel: Channel) -> None:
-        super().__init__(*what)
-        self.channel = channel
-
-    def grab(self, out: np.ndarray) -> None:
-        """Grab one channel of a frame whose exposure began after the call into `out` (h, w)."""
-        self.check_open()
-        check_frame(self, out)
-        with self._grab_fresh() as image:
-            extract_channel(self._convert_rgb(image), self.channel, out)
-
-    def grab_colour(self) -> np.ndarray:
-        """Grab a frame whose exposure began after the call, (h, w, 3) RGB."""
-        self.check_open()
-        with self._grab_fresh() as image:
-            return np.array(self._convert_rgb(image))
-
-    def _convert_rgb(self, image: Image) -> np.ndarray:
-        """Convert the bytes of an image to (h, w, 3) RGB."""
-        return self.pixels.rgb(self.pixels.view_samples(image.data, image.size, image.padding))
-
-
-def genicam_camera(
-    producer: str | None = None,
-    serial: str | int | None = None,
-    model: str | None = None,
-    exposure_ms: float | None = None,
-    gain: float | None = None,
-    pixel_format: str | None = None,
-    channel: Channel = "green",
-    trigger: Trigger | None = None,
-    line: str | None = None,
-) -> Camera:
-    """Return the connected camera of that serial number or model, or the only one there is; not opened yet.
-
-    `producer` is the .cti file of its maker's software, None: all that are installed. `exposure_ms` and `gain` are set
-    when it is opened, None: unchanged. `pixel_format` None: the deepest mono of up to 12 bits that comes
-    unpacked; of a colour camera its colours, of which `channel` is decoded. `trigger` "software" (where it has one),
-    "hardware" with the name of its `line`, or "free". Raises InputError for what the camera has not, or where several
-    fit; DeviceError where none is connected.
-    """
-    if channel not in get_args(Channel):
-        raise InputError(f"no channel is called {channel!r}: use one of {', '.join(get_args(Channel))}")
-    camera = _choose_camera(list_cameras(producer), None if serial is None else str(serial), model)
-    name, first = f"the camera {camera}", CameraSettings(exposure_ms, gain)
-    with open_node_map(camera) as node_map:
-        features = Features(node_map, name)
-        pixels, begun = features.choose_format(pixel_format), features.choose_trigger(trigger, line)
-        features.check_settings(first)
-        what = (camera, features.size(), pixels, begun, line, first)
-    return GenicamColourCamera(*what, channel=channel) if pixels.colour else GenicamCamera(*what)
-
-
 def _choose_camera(cameras: list[ListedCamera], serial: str | None, model: str | None) -> ListedCamera:
     """Return the only camera of that serial number and model. Raises InputError or DeviceError with a list."""
     listed = "; ".join(map(str, cameras))
@@ -197,7 +167,7 @@ def _choose_camera(cameras: list[ListedCamera], serial: str | None, model: str |
     raise DeviceError("no camera is connected: plug one in, wait until it has started, and close other programs")
 
 
-def list_connected() -> list[str]:
+def list_genicam_cameras() -> list[str]:
     """List the connected cameras: maker, model, serial number. Raises DeviceError without producers."""
     return [str(camera) for camera in list_cameras()]
 
@@ -208,6 +178,6 @@ DRIVER = Driver(
     "a USB3 Vision or GigE Vision camera (FLIR, Basler, IDS, …)",
     needs="the software of the camera's maker, which brings a GenTL producer (a .cti file)",
     packages={"harvesters": _INSTALL, "genicam": _INSTALL},
-    camera=genicam_camera,
-    list_connected=list_connected,
+    camera=GenicamCamera,
+    list_connected=list_genicam_cameras,
 )

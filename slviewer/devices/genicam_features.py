@@ -35,7 +35,7 @@ class Features:
 
     def size(self) -> tuple[int, int]:
         """Return the (width, height) px of its images: the whole sensor, or the region that is set in it."""
-        width, height = self._get_readable("Width"), self._get_readable("Height")
+        width, height = self._get_node("Width"), self._get_node("Height")
         if width is None or height is None:
             raise DeviceError(f"{self._name} does not report its image size: use another camera")
         with as_device_error(self._name):
@@ -64,7 +64,7 @@ class Features:
             raise InputError(f"no trigger is called {wanted!r}: use one of {', '.join(get_args(Trigger))}")
         has_mode = "On" in self._list_choices("TriggerMode")
         sources = self._list_choices("TriggerSource") if has_mode else []
-        software = "Software" in sources and self._has_node("TriggerSoftware")
+        software = "Software" in sources and self._get_node("TriggerSoftware", _IMPLEMENTED) is not None
         if wanted is None:
             return "software" if software else "free"
         if wanted == "software" and not software:
@@ -84,7 +84,7 @@ class Features:
         if wanted.exposure_ms is not None and self._get_exposure_node() is None:
             raise InputError(f"{self._name} has no exposure time that can be set: leave exposure_ms out")
         if wanted.gain is not None and self._get_gain_node() is None:
-            gain = self._get_readable("Gain")
+            gain = self._get_node("Gain")
             why = "no gain" if gain is None else "a gain in device-specific steps of unknown factor"
             raise InputError(f"{self._name} has {why}: leave `gain` out, and set it with its maker's software")
 
@@ -97,15 +97,13 @@ class Features:
             for name in _AUTOMATIC:
                 self._choose(name, "Off")
             for name in _ALTERING:
-                node = self._get_writable(name)
-                if node is not None:
+                if (node := self._get_node(name, _WRITABLE)) is not None:
                     node.value = False
-            gamma = self._get_writable("Gamma")
-            if gamma is not None:
+            if (gamma := self._get_node("Gamma", _WRITABLE)) is not None:
                 _set_nearest(gamma, 1.0)
             self._choose("GainSelector", "All")
             self._set_trigger(trigger, line)
-            current = self._get_readable("PixelFormat")
+            current = self._get_node("PixelFormat")
             if current is None or current.value != chosen.name:
                 raise DeviceError(f"{self._name} did not accept the pixel format {chosen.name}: choose another one")
 
@@ -139,11 +137,11 @@ class Features:
 
     def _get_exposure_node(self) -> Any:
         """Return the readable node of the exposure time; None where there is none."""
-        return next((node for name in _EXPOSURES if (node := self._get_readable(name)) is not None), None)
+        return next((node for name in _EXPOSURES if (node := self._get_node(name)) is not None), None)
 
     def _get_gain_node(self) -> Any:
         """Return the readable node of the gain, if its unit is dB; else None."""
-        gain = self._get_readable("Gain")
+        gain = self._get_node("Gain")
         return gain if gain is not None and str(getattr(gain, "unit", "")).strip().lower() == "db" else None
 
     def _set_trigger(self, trigger: Trigger, line: str | None) -> None:
@@ -154,16 +152,14 @@ class Features:
             self._choose("TriggerMode", "Off")
         if trigger == "free":
             return
-        for selector in (name for name in _FRAME_TRIGGERS if name in selectors):
-            self._choose("TriggerSelector", selector)
-            break
+        self._choose("TriggerSelector", next((name for name in _FRAME_TRIGGERS if name in selectors), ""))
         source = "Software" if trigger == "software" else line
         if not (self._choose("TriggerSource", source or "") and self._choose("TriggerMode", "On")):
             raise DeviceError(f"{self._name} did not accept the trigger {source}: choose another one")
 
     def _list_choices(self, name: str) -> list[str]:
         """List the readable entries of the enumeration `name`."""
-        node = self._get_readable(name)
+        node = self._get_node(name)
         if node is None:
             return []
         with as_device_error(self._name):
@@ -178,23 +174,11 @@ class Features:
             node.value = choice
         return True
 
-    def _get_readable(self, name: str) -> Any:
-        """Return the node `name` if it can be read now; else None."""
-        return self._get_node(name, _READABLE)
-
-    def _get_writable(self, name: str) -> Any:
-        """Return the node `name` if it can be written now; else None."""
-        return self._get_node(name, _WRITABLE)
-
-    def _get_node(self, name: str, access: tuple[int, ...]) -> Any:
+    def _get_node(self, name: str, access: tuple[int, ...] = _READABLE) -> Any:
         """Return the node `name`, if it has one of these access modes now; else None."""
         with as_device_error(self._name):
             node = getattr(self._nodes, name, None)
             return node if node is not None and node.get_access_mode() in access else None
-
-    def _has_node(self, name: str) -> bool:
-        """Whether the camera implements a node, even if it is not accessible now."""
-        return self._get_node(name, _IMPLEMENTED) is not None
 
 
 def _is_settable(node: Any) -> bool:

@@ -6,15 +6,15 @@ An alarm is never unlocked by itself: only who looks at the table knows that it 
 
 import re
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 import msgspec
 
 from slviewer.devices.drivers import Driver
-from slviewer.devices.opening import Openable
-from slviewer.devices.protocols import check_angle
+from slviewer.devices.protocols import Openable, check_angle
 from slviewer.errors import InputError, TurntableError
 
 Dialect = Literal["auto", "grbl", "marlin"]
@@ -88,98 +88,89 @@ TIMING = ControllerTiming()
 """For real controllers."""
 
 
+@dataclass(eq=False)
 class GcodeTurntable(Openable):
-    """A turntable on one axis of a GRBL or Marlin controller. It is open while its serial port is."""
+    """A turntable on one axis of a GRBL or Marlin controller at a serial port, such as /dev/ttyUSB0 or COM3. It is open
+    while its port is.
+
+    `degrees_per_unit`: degrees that the table turns for one unit (mm) of the axis, 1 where the controller's steps per
+    mm were set to steps per degree; negative to reverse it. `settle_ms` passes after it stands still. `boot_s`,
+    `reply_s`: how long it may take to start, and to accept a command, in seconds of the clock of `timing`. Raises
+    InputError.
+    """
+
+    port: str
+    baud: Annotated[int, msgspec.Meta(ge=1200, le=4_000_000)] = 115_200
+    dialect: Dialect = "auto"
+    axis: Literal["X", "Y", "Z", "A", "B", "C", "E"] = "X"
+    degrees_per_unit: Annotated[float, msgspec.Meta(ge=-1e4, le=1e4)] = 1.0
+    speed_deg_s: Positive = 20.0
+    settle_ms: Annotated[float, msgspec.Meta(ge=0, le=60_000)] = 300.0
+    limits_deg: tuple[float, float] | None = None
+    boot_s: Positive = BOOT_S
+    reply_s: Positive = REPLY_S
+    timing: ControllerTiming = TIMING
 
     is_absolute = False
 
-    def __init__(
-        self,
-        port: str,
-        baud: Annotated[int, msgspec.Meta(ge=1200, le=4_000_000)] = 115_200,
-        dialect: Dialect = "auto",
-        axis: Literal["X", "Y", "Z", "A", "B", "C", "E"] = "X",
-        degrees_per_unit: Annotated[float, msgspec.Meta(ge=-1e4, le=1e4)] = 1.0,
-        speed_deg_s: Positive = 20.0,
-        settle_ms: Annotated[float, msgspec.Meta(ge=0, le=60_000)] = 300.0,
-        limits_deg: Sequence[float] | None = None,
-        boot_s: Positive = BOOT_S,
-        reply_s: Positive = REPLY_S,
-        timing: ControllerTiming = TIMING,
-    ) -> None:
-        """The controller at a serial port, such as /dev/ttyUSB0 or COM3.
-
-        `degrees_per_unit`: degrees that the table turns for one unit (mm) of the axis, 1 where the controller's steps
-        per mm were set to steps per degree; negative to reverse it. `settle_ms` passes after it stands still.
-        `boot_s`, `reply_s`: how long it may take to start, and to accept a command, in seconds of the clock of
-        `timing`. Raises InputError.
-        """
-        if degrees_per_unit == 0:
+    def __post_init__(self) -> None:
+        if self.degrees_per_unit == 0:
             raise InputError("degrees_per_unit = 0 turns nothing: give the degrees per unit of the axis")
-        if limits_deg is not None and not (len(limits_deg) == 2 and limits_deg[0] < limits_deg[1]):
-            raise InputError(f"limits_deg = {list(limits_deg)} are no limits: give two, the lower one first")
-        super().__init__(f"the turntable at {port}")
-        self.limits_deg = None if limits_deg is None else (float(limits_deg[0]), float(limits_deg[1]))
-        self._port, self._baud, self._dialect, self._axis = port, baud, dialect, axis
-        self._degrees_per_unit, self._speed_deg_s, self._settle_ms = degrees_per_unit, speed_deg_s, settle_ms
-        self._boot_s, self._reply_s = boot_s, reply_s
-        self._timing, self._clock = timing, timing.clock
+        if (limits := self.limits_deg) is not None:
+            if not (len(limits) == 2 and limits[0] < limits[1]):
+                raise InputError(f"limits_deg = {list(limits)} are no limits: give two, the lower one first")
+            self.limits_deg = float(limits[0]), float(limits[1])
+        super().__init__(f"the turntable at {self.port}")
+        self._clock = self.timing.clock
         self._serial: Any = None
         self._buffer = b""
         self._unreadable = 0  # bytes that are no text, since it was opened
         self._is_marlin = False
 
-    def open(self) -> None:
+    def _start(self) -> None:
         """Open the port, and wait for the controller. Raises TurntableError where it does not answer or is locked."""
         import serial  # lazily: an optional package
 
-        super().open()
         try:
-            try:
-                self._serial = serial.Serial(
-                    self._port,
-                    self._baud,
-                    timeout=self._timing.poll_s / 2,
-                    write_timeout=self._reply_s,
-                    exclusive=True,
-                )
-            except (OSError, ValueError) as error:
-                raise TurntableError(
-                    f"{self.name} cannot be opened ({error}): plug it in, end other programs that use it, and check "
-                    "the port; `slviewer devices` lists those that are connected"
-                ) from error
-            self._buffer, self._unreadable = b"", 0
-            self._is_marlin = self._probe() == "marlin"
-            self.position_deg()  # raises where it is locked
-        except BaseException:
-            self.close()
-            raise
+            self._serial = serial.Serial(
+                self.port,
+                self.baud,
+                timeout=self.timing.poll_s / 2,
+                write_timeout=self.reply_s,
+                exclusive=True,
+            )
+        except (OSError, ValueError) as error:
+            raise TurntableError(
+                f"{self.name} cannot be opened ({error}): plug it in, end other programs that use it, and check "
+                "the port; `slviewer devices` lists those that are connected"
+            ) from error
+        self._buffer, self._unreadable = b"", 0
+        self._is_marlin = self._probe() == "marlin"
+        self.position_deg()  # raises where it is locked
 
     def close(self) -> None:
         """Close the port; a motion that was begun is stopped before that by `turn_to`."""
         super().close()
         port, self._serial = self._serial, None
         if port is not None:
-            try:
+            with suppress(OSError):  # it was unplugged
                 port.close()
-            except OSError:  # it was unplugged
-                return
 
     def position_deg(self) -> float:
         """Ask the controller for the angle that it counts."""
         self.check_open()
-        return (self._read_marlin() if self._is_marlin else self._read_grbl()[1]) * self._degrees_per_unit
+        return (self._read_marlin() if self._is_marlin else self._read_grbl()[1]) * self.degrees_per_unit
 
     def turn_to(self, deg: float, check: Callable[[], None] = lambda: None) -> None:
         """Turn to an angle, wait until it stands still, and `settle_ms` more."""
         self.check_open()
         check_angle(self, deg)
         change_deg = deg - self.position_deg()
-        units = change_deg / self._degrees_per_unit
-        feed = 60.0 * self._speed_deg_s / abs(self._degrees_per_unit)  # units a minute
-        end = self._clock() + 2.0 * abs(change_deg) / self._speed_deg_s + _SPARE_S * self._reply_s / REPLY_S
+        units = change_deg / self.degrees_per_unit
+        feed = 60.0 * self.speed_deg_s / abs(self.degrees_per_unit)  # units a minute
+        end = self._clock() + 2.0 * abs(change_deg) / self.speed_deg_s + _SPARE_S * self.reply_s / REPLY_S
         # Relative to what it counts now: the reported and the commanded angle may have different origins (G92, G54).
-        move = f"{self._axis}{units:.4f} F{feed:.2f}"
+        move = f"{self.axis}{units:.4f} F{feed:.2f}"
         try:
             check()
             if self._is_marlin:
@@ -193,9 +184,9 @@ class GcodeTurntable(Openable):
                     check()
                     if self._clock() > end:
                         raise TurntableError(f"{self.name} did not reach {deg:g} degrees in time: {_CHECK_TABLE}")
-                    time.sleep(self._timing.poll_s)
+                    time.sleep(self.timing.poll_s)
             reached_deg = self.position_deg()
-            if abs(reached_deg - deg) > max(_TOLERANCE_DEG, 0.01 * abs(self._degrees_per_unit)):
+            if abs(reached_deg - deg) > max(_TOLERANCE_DEG, 0.01 * abs(self.degrees_per_unit)):
                 raise TurntableError(
                     f"{self.name} stopped at {reached_deg:.2f} instead of {deg:g} degrees: {_CHECK_TABLE}, and end "
                     "other programs that use it"
@@ -203,17 +194,17 @@ class GcodeTurntable(Openable):
         except BaseException:
             self._stop()
             raise
-        time.sleep(self._settle_ms / 1000)
+        time.sleep(self.settle_ms / 1000)
 
     def _probe(self) -> Dialect:
         """Ask who is there until the controller answers. Raises TurntableError where it does not, or not readably."""
-        end = self._clock() + self._boot_s
+        end = self._clock() + self.boot_s
         while self._clock() < end:
             for question, dialect, answer in (("$I", "grbl", "[VER:"), ("M115", "marlin", "FIRMWARE_NAME")):
-                if self._dialect not in ("auto", dialect):
+                if self.dialect not in ("auto", dialect):
                     continue
                 self._write(f"{question}\n".encode())
-                until = min(end, self._clock() + _ANSWER_S * self._boot_s / BOOT_S)
+                until = min(end, self._clock() + _ANSWER_S * self.boot_s / BOOT_S)
                 while (line := self._read_line(until)) is not None:
                     refused = dialect == "grbl" and line.startswith("error:")  # it is GRBL, but paused
                     if answer in line or refused:
@@ -222,31 +213,31 @@ class GcodeTurntable(Openable):
                     if line.startswith(("ok", "error:")):
                         break
         if self._unreadable:
-            raise TurntableError(f"{self.name} sends unreadable characters at {self._baud} baud: set its own `baud`")
+            raise TurntableError(f"{self.name} sends unreadable characters at {self.baud} baud: set its own `baud`")
         raise TurntableError(
-            f"{self.name} does not answer as {'GRBL or Marlin' if self._dialect == 'auto' else self._dialect} within "
-            f"{self._boot_s:g} s: switch it on, and check `port`, `baud` and `dialect`"
+            f"{self.name} does not answer as {'GRBL or Marlin' if self.dialect == 'auto' else self.dialect} within "
+            f"{self.boot_s:g} s: switch it on, and check `port`, `baud` and `dialect`"
         )
 
     def _drain(self) -> None:
         """Discard lines until none comes: late answers to earlier questions must not confirm a command."""
-        while self._read_line(self._clock() + self._timing.quiet_s) is not None:
+        while self._read_line(self._clock() + self.timing.quiet_s) is not None:
             pass
 
     def _command(self, command: str, end: float | None = None, check: Callable[[], None] = lambda: None) -> None:
         """Send a line, and wait until it is accepted; `check()` is called meanwhile."""
         self._write(f"{command}\n".encode())
-        end = self._clock() + self._reply_s if end is None else end
+        end = self._clock() + self.reply_s if end is None else end
         while self._clock() < end:
             check()
-            line = self._read_line(min(end, self._clock() + self._timing.poll_s))
+            line = self._read_line(min(end, self._clock() + self.timing.poll_s))
             if line is None:
                 continue
             self._check_line(line, command)
             if line.startswith("ok"):
                 return
             if line.startswith("echo:busy") and command != "M400":  # it says every two seconds that it is alive
-                end = self._clock() + self._reply_s
+                end = self._clock() + self.reply_s
         raise TurntableError(
             f"{self.name} did not confirm {command!r} in time: switch it off and on, and check its cable"
         )
@@ -254,7 +245,7 @@ class GcodeTurntable(Openable):
     def _read_grbl(self) -> tuple[str, float]:
         """Ask GRBL for its state and its axis, in units. Raises TurntableError in a state in which it cannot turn."""
         self._write(b"?")
-        end = self._clock() + self._reply_s
+        end = self._clock() + self.reply_s
         while (line := self._read_line(end)) is not None:
             if match := re.fullmatch(r"<(\w+)[^|]*\|[MW]Pos:([-\d.,]+)(\|.*)?>", line):
                 state, positions = match[1], match[2].split(",")
@@ -262,12 +253,12 @@ class GcodeTurntable(Openable):
                     raise TurntableError(f"{self.name} is locked by an alarm: {_CHECK_TABLE}, {_UNLOCK}")
                 if state in _BLOCKED:
                     raise TurntableError(f"{self.name} {_BLOCKED[state]}")
-                index = "XYZABC".find(self._axis)
+                index = "XYZABC".find(self.axis)
                 try:
                     return state, float(positions[index] if index >= 0 else "")
                 except (IndexError, ValueError):
                     raise TurntableError(
-                        f"{self.name} has no axis {self._axis}, it has {'XYZABC'[: len(positions)]}: set `axis`"
+                        f"{self.name} has no axis {self.axis}, it has {'XYZABC'[: len(positions)]}: set `axis`"
                     ) from None
             self._check_line(line, "?")
         raise TurntableError(f"{self.name} did not report its state in time: switch it off and on, and check its cable")
@@ -275,25 +266,24 @@ class GcodeTurntable(Openable):
     def _read_marlin(self) -> float:
         """Ask Marlin for the position of the axis, in units."""
         self._write(b"M114\n")
-        end, position = self._clock() + self._reply_s, None
+        end, position = self._clock() + self.reply_s, None
         while (line := self._read_line(end)) is not None:
             self._check_line(line, "M114")
-            match = re.search(rf"(?<!\w){self._axis}:\s*(-?\d+(?:\.\d+)?)", line.split("Count")[0])
+            match = re.search(rf"(?<!\w){self.axis}:\s*(-?\d+(?:\.\d+)?)", line.split("Count")[0])
             position = float(match[1]) if match else position
             if line.startswith("ok"):
                 if position is None:
-                    raise TurntableError(f"{self.name} has no axis {self._axis}: set `axis`")
+                    raise TurntableError(f"{self.name} has no axis {self.axis}: set `axis`")
                 return position
         raise TurntableError(f"{self.name} did not report its angle in time: switch it off and on, and check its cable")
 
     def _check_line(self, line: str, command: str) -> None:
         """Raise TurntableError for a line that reports an alarm, an error or a restart."""
-        if match := re.match(r"ALARM:(\d+)", line):
-            number = int(match[1])
-            meaning = ALARMS.get(number, f"see the alarms of its firmware; {_CHECK_TABLE}, {_UNLOCK}")
-            raise TurntableError(f"{self.name} raised alarm {number}: {meaning}")
-        if match := re.match(r"error:(\d+)", line):
-            number = int(match[1])
+        if match := re.match(r"(ALARM|error):(\d+)", line):
+            kind, number = match[1], int(match[2])
+            if kind == "ALARM":
+                meaning = ALARMS.get(number, f"see the alarms of its firmware; {_CHECK_TABLE}, {_UNLOCK}")
+                raise TurntableError(f"{self.name} raised alarm {number}: {meaning}")
             meaning = ERRORS.get(number, "see the errors of its firmware")
             raise TurntableError(f"{self.name} refused {command!r} with error {number}: {meaning}")
         if line.startswith(("Error:", "!!")):
@@ -309,7 +299,7 @@ class GcodeTurntable(Openable):
             self._write(b"M410\n" if self._is_marlin else b"\x85")
             end = self._clock() + _STOP_S
             while not self._is_marlin and self._clock() < end and self._read_grbl()[0] != "Idle":
-                time.sleep(self._timing.poll_s)
+                time.sleep(self.timing.poll_s)
             self._drain()
         except TurntableError:  # what made it stop is reported
             return
@@ -346,7 +336,7 @@ class GcodeTurntable(Openable):
         return TurntableError(f"{self.name} was unplugged ({error}): plug it in again")
 
 
-def list_connected() -> list[str]:
+def list_serial_ports() -> list[str]:
     """List the serial ports of this machine, with what is behind them."""
     from serial.tools.list_ports import comports
 
@@ -358,5 +348,5 @@ DRIVER = Driver(
     "a turntable on a GRBL or Marlin controller at a serial port",
     packages={"serial": "pip install 'slviewer[turntable]'"},
     turntable=GcodeTurntable,
-    list_connected=list_connected,
+    list_connected=list_serial_ports,
 )

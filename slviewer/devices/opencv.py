@@ -5,9 +5,8 @@ are when it is opened, as nothing may change by itself during a capture.
 """
 
 import math
-from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import partial
-from typing import get_args
 
 import cv2
 import numpy as np
@@ -22,9 +21,16 @@ from slviewer.devices.opencv_controls import (
     set_value,
 )
 from slviewer.devices.opencv_reader import TIMING, Reader, StreamTiming
-from slviewer.devices.opencv_source import connect, describe_source, list_connected
-from slviewer.devices.opening import Openable
-from slviewer.devices.protocols import CameraSettings, Channel, check_frame, extract_channel
+from slviewer.devices.opencv_source import connect_source, describe_source, list_webcams
+from slviewer.devices.protocols import (
+    CameraSettings,
+    Channel,
+    Openable,
+    check_channel,
+    check_frame,
+    check_image_size,
+    extract_channel,
+)
 from slviewer.errors import DeviceError, InputError
 
 SETTLING = 3
@@ -34,85 +40,69 @@ _IN_USE: dict[int | str, "OpenCVCamera"] = {}
 """Who has which source open in this process: most cannot be opened a second time to query their size."""
 
 
+@dataclass(eq=False)
 class OpenCVCamera(Openable):
-    """One `channel` of an OpenCV source. `notes` lists, in sentences, settings that were refused or changed since it
-    was opened.
+    """One `channel` of the webcam with the number `source`, or of the video at a path or an address. `notes` lists, in
+    sentences, settings that were refused or changed since it was opened.
 
-    A gain in the camera's own units is no factor on the grey levels: `settings` does not report it and `apply` does
-    not set it, only the constructor does.
+    `size` is (width, height) px, which a webcam is switched to; without it, it is the one in use, or the source must
+    answer now. The settings are made when it is opened, None leaves one as it is: exposure in ms, gain and focus in the
+    camera's own units, white balance in K. `timing`: how long pictures are waited for. A gain in the camera's own units
+    is no factor on the grey levels: `settings` does not report it and `apply` does not set it.
+
+    Raises InputError for invalid options, DeviceError for a source that does not answer.
     """
+
+    source: int | str = 0
+    size: tuple[int, int] = None  # type: ignore[assignment]  # until it is known
+    exposure_ms: float | None = None
+    gain: float | None = None
+    focus: float | None = None
+    white_balance: float | None = None
+    channel: Channel = "green"
+    timing: StreamTiming = TIMING
 
     dtype = np.dtype(np.uint8)
 
-    def __init__(
-        self,
-        source: int | str = 0,
-        size: Sequence[int] | None = None,
-        exposure_ms: float | None = None,
-        gain: float | None = None,
-        focus: float | None = None,
-        white_balance: float | None = None,
-        channel: Channel = "green",
-        timing: StreamTiming = TIMING,
-    ) -> None:
-        """The webcam of that number, or the video at a path or an address.
-
-        `size` is (width, height) px, which a webcam is switched to; without it, it is the one in use, or the source
-        must answer now. The settings are made when it is opened, None leaves one as it is: exposure in ms, gain and
-        focus in the camera's own units, white balance in K. `timing`: how long pictures are waited for.
-
-        Raises InputError for invalid options, DeviceError for a source that does not answer.
-        """
-        if isinstance(source, str) and source.isdecimal():
-            source = int(source)
-        if not isinstance(source, int | str) or isinstance(source, bool) or (isinstance(source, int) and source < 0):
-            raise InputError(f"{source!r} is no camera: give a webcam's number, a video file, or an address")
-        if size is not None and (len(size) != 2 or not all(isinstance(side, int) and side > 0 for side in size)):
-            raise InputError(f"{size!r} is no size of a camera: give its width and height in px, such as [1280, 720]")
-        if channel not in get_args(Channel):
-            raise InputError(f"no channel is called {channel!r}: use one of {', '.join(get_args(Channel))}")
-        if not all(value is None or math.isfinite(value) for value in (gain, focus, white_balance)):
+    def __post_init__(self) -> None:
+        source = self.source = _check_source(self.source)
+        wanted = None if self.size is None else check_image_size("camera", self.size)
+        check_channel(self.channel)
+        CameraSettings(self.exposure_ms)
+        if not all(value is None or math.isfinite(value) for value in (self.gain, self.focus, self.white_balance)):
             raise InputError("a gain, a focus or a white balance that is no number cannot be set: give one")
         super().__init__(describe_source(source))
-        known = _IN_USE.get(source)
-        wanted = (size[0], size[1]) if size is not None else known.size if known is not None else None
-        self._source, self._connect, self._timing = source, partial(connect, source, wanted, timing), timing
-        self._exposure_ms = CameraSettings(exposure_ms).exposure_ms
-        self._gain, self._focus, self._white_balance = gain, focus, white_balance
-        self._channel = channel
+        if wanted is None and source in _IN_USE:
+            wanted = _IN_USE[source].size
+        self._connect = partial(connect_source, source, wanted, self.timing)
         self._reader: Reader | None = None
         self._dialect: Dialect | None = None
         self._next: np.ndarray | None = None  # the video's picture that was read to learn its size
         self._read, self._unsettled = 0, 0
         self._notices: dict[str, str] = {}
-        self.size: tuple[int, int] = wanted or self._probe_size()
+        self.size = wanted or self._probe_size()
 
     @property
     def notes(self) -> tuple[str, ...]:
         """Warnings about the settings, a sentence each."""
         return tuple(f"{self.name}: {sentence}" for sentence in self._notices.values() if sentence)
 
-    def open(self) -> None:
+    def _start(self) -> None:
         """Start reading. Raises DeviceError where the source does not answer, or its frames have another size."""
-        super().open()
-        try:
-            if self._reader is not None:
-                self._reader.join(self._timing.opening_s)  # it may hang in a call, the device still in its hands
-            self._reader = Reader(self.name, self._connect, self._timing)
-            self._next, self._read = self._check_size(self._reader.first()), 0
-            self._notices = {}
-            self._reader.do(self._prepare)
-            _IN_USE[self._source] = self
-        except BaseException:
-            self.close()
-            raise
+        if self._reader is not None:
+            self._reader.join(self.timing.opening_s)  # it may hang in a call, the device still in its hands
+        self._reader = Reader(self.name, self._connect, self.timing)
+        self._next, self._read = self._check_size(self._reader.first()), 0
+        self._notices = {}
+        self._reader.do(self._prepare)
+        _IN_USE[self.source] = self
 
     def close(self) -> None:
         """Release the source, if necessary once it returns from a blocking call."""
         if self._reader is not None:
             self._reader.close()
-        if _IN_USE.get(self._source) is self:
-            del _IN_USE[self._source]
+        if _IN_USE.get(self.source) is self:
+            del _IN_USE[self.source]
         super().close()
 
     def grab(self, out: np.ndarray) -> None:
@@ -122,7 +112,7 @@ class OpenCVCamera(Openable):
         if image.ndim == 2:
             np.copyto(out, image)
         else:
-            extract_channel(image[..., ::-1], self._channel, out)
+            extract_channel(image[..., ::-1], self.channel, out)
 
     def grab_colour(self) -> np.ndarray:
         """As `grab`, (h, w, 3) RGB; three equal channels for a monochrome source."""
@@ -155,17 +145,17 @@ class OpenCVCamera(Openable):
     def _prepare(self, capture: cv2.VideoCapture) -> None:
         """Apply the constructor's settings; called on the reader's thread."""
         dialect = self._dialect = dialect_of(capture)
-        controls = (self._gain, self._focus, self._white_balance)
+        controls = (self.gain, self.focus, self.white_balance)
         if dialect is None:
-            if self._require_reader().live or (self._exposure_ms, *controls) != (None,) * 4:
+            if self._require_reader().live or (self.exposure_ms, *controls) != (None,) * 4:
                 self._notices["controls"] = (
                     "its exposure, gain, focus and white balance cannot be set from here: set them at the camera "
                     "itself, and switch off everything automatic"
                 )
             return
         self._notices |= disable_automatics(capture, dialect)
-        if self._exposure_ms is not None:
-            self._notices["exposure"] = set_exposure(capture, dialect, self._exposure_ms)
+        if self.exposure_ms is not None:
+            self._notices["exposure"] = set_exposure(capture, dialect, self.exposure_ms)
         properties = (cv2.CAP_PROP_GAIN, cv2.CAP_PROP_FOCUS, dialect.white_balance)
         for control, value, what in zip(properties, controls, ("gain", "focus", "white balance"), strict=True):
             if value is not None:
@@ -203,7 +193,7 @@ class OpenCVCamera(Openable):
 
     def _probe_size(self) -> tuple[int, int]:
         """Return the source's default size (width, height) px."""
-        reader = Reader(self.name, self._connect, self._timing)
+        reader = Reader(self.name, self._connect, self.timing)
         try:
             height, width = reader.first().shape[:2]
             return width, height
@@ -211,10 +201,19 @@ class OpenCVCamera(Openable):
             reader.close()
 
 
+def _check_source(source: int | str) -> int | str:
+    """Return a webcam's number, a path or an address. Raises InputError for anything else."""
+    if isinstance(source, str) and source.isdecimal():
+        source = int(source)
+    if not isinstance(source, int | str) or isinstance(source, bool) or (isinstance(source, int) and source < 0):
+        raise InputError(f"{source!r} is no camera: give a webcam's number, a video file, or an address")
+    return source
+
+
 DRIVER = Driver(
     "opencv",
     "a webcam, a video file, or a stream (MJPEG, RTSP)",
     needs="a camera's number, a file, or an address, as `source`",
     camera=OpenCVCamera,
-    list_connected=list_connected,
+    list_connected=list_webcams,
 )

@@ -55,8 +55,8 @@ _DIALECTS = {
 
 
 def dialect_of(capture: cv2.VideoCapture) -> Dialect | None:
-    """Return the control conventions of the open `capture`'s backend; None where controls are not accessible.
-    stream, and on macOS those of any camera (cap_avfoundation_mac.mm sets a size and a frame rate only).
+    """Return the control conventions of the open `capture`'s backend; None where controls are not accessible: those of
+    a stream, and on macOS those of any camera (cap_avfoundation_mac.mm sets a size and a frame rate only).
     """
     dialect = _DIALECTS.get(capture.getBackendName())
     if dialect is _V4L2:
@@ -70,25 +70,23 @@ def disable_automatics(capture: cv2.VideoCapture, words: Dialect) -> dict[str, s
 
     A pattern sequence means nothing when its frames are exposed differently.
     """
-    refusals = {}
     if words.automatics:
-        for what, control, off in words.automatics:
-            if capture.get(control) != UNKNOWN and not (capture.set(control, off) and capture.get(control) == off):
-                refusals[f"automatic {what}"] = (
-                    f"its automatic {what} cannot be switched off: look for a switch at the camera itself"
-                )
-        return refusals
-    for what, control in (
-        ("exposure", cv2.CAP_PROP_EXPOSURE),
-        ("white balance", words.white_balance),
-        ("focus", cv2.CAP_PROP_FOCUS),
-    ):
-        now = capture.get(control)
-        if now != UNKNOWN and not capture.set(control, now):
-            refusals[f"automatic {what}"] = (
-                f"its automatic {what} cannot be switched off: do it in the system's camera settings"
-            )
-    return refusals
+        remedy = "look for a switch at the camera itself"
+        automatic = [
+            what
+            for what, control, off in words.automatics
+            if capture.get(control) != UNKNOWN and not (capture.set(control, off) and capture.get(control) == off)
+        ]
+    else:
+        remedy = "do it in the system's camera settings"
+        controls = {
+            "exposure": cv2.CAP_PROP_EXPOSURE,
+            "white balance": words.white_balance,
+            "focus": cv2.CAP_PROP_FOCUS,
+        }
+        current = {what: capture.get(control) for what, control in controls.items()}
+        automatic = [what for what, now in current.items() if now != UNKNOWN and not capture.set(controls[what], now)]
+    return {f"automatic {what}": f"its automatic {what} cannot be switched off: {remedy}" for what in automatic}
 
 
 def exposure_ms(capture: cv2.VideoCapture, words: Dialect) -> float | None:

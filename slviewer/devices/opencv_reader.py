@@ -9,6 +9,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
+from concurrent.futures import Future
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -88,30 +89,6 @@ class Pace:
         return end - start > _WINDOW_S / 2 and busy - idle > _SATURATED * (end - start)
 
 
-class _Job:
-    """A function to run on the capture between two pictures, with its result."""
-
-    def __init__(self, work: Callable[[cv2.VideoCapture], Any]) -> None:
-        self._work = work
-        self.done = False
-        self._result: Any = None
-        self._error: Exception | None = None
-
-    def run(self, capture: cv2.VideoCapture) -> None:
-        """Run the work on the capture, and store its result or error."""
-        try:
-            self._result = self._work(capture)
-        except Exception as error:
-            self._error = error
-        self.done = True
-
-    def result(self) -> Any:
-        """Return the result of the work, or raise its error."""
-        if self._error is not None:
-            raise self._error
-        return self._result
-
-
 class _Wanted:
     """A requested picture: the last of the next `frames` new ones."""
 
@@ -130,7 +107,7 @@ class Reader:
     def __init__(self, name: str, connect: Callable[[], Connected], timing: StreamTiming = TIMING) -> None:
         self._name, self._connect, self._timing = name, connect, timing
         self._condition = threading.Condition()
-        self._jobs: deque[_Job] = deque()
+        self._jobs: deque[tuple[Callable[[cv2.VideoCapture], Any], Future[Any]]] = deque()
         self._wanted: _Wanted | None = None
         self._first: np.ndarray | None = None
         self._arrived = timing.clock()
@@ -155,11 +132,11 @@ class Reader:
 
     def do(self, work: Callable[[cv2.VideoCapture], T]) -> T:
         """Run `work(capture)` on the reader's thread between two pictures; returns its result."""
-        job = _Job(work)
+        job: Future[T] = Future()
         with self._condition:
-            self._jobs.append(job)
+            self._jobs.append((work, job))
             self._condition.notify_all()
-            self._wait_until(lambda: job.done, self._timing.patience_s)
+            self._wait_until(job.done, self._timing.patience_s)
         return job.result()
 
     def picture(self, later: int = 0) -> np.ndarray:
@@ -224,8 +201,11 @@ class Reader:
                         self._condition.wait_for(lambda: self._jobs or self._closing)
                     jobs = list(self._jobs)
                     self._jobs.clear()
-                for job in jobs:
-                    job.run(capture)
+                for work, job in jobs:
+                    try:
+                        job.set_result(work(capture))
+                    except Exception as error:
+                        job.set_exception(error)
                 if jobs:
                     with self._condition:
                         self._condition.notify_all()

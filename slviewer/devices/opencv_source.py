@@ -29,7 +29,7 @@ def describe_source(source: int | str) -> str:
     return f"the camera {source}" if _is_device(source) else f"the video {Path(source).name}"
 
 
-def connect(source: int | str, size: tuple[int, int] | None, timing: StreamTiming = TIMING) -> Connected:
+def connect_source(source: int | str, size: tuple[int, int] | None, timing: StreamTiming = TIMING) -> Connected:
     """Open a source, a webcam at `size` (width, height) px where supported. Raises DeviceError.
 
     An address may take `patience_s` of the timing to answer, and later to send more.
@@ -61,7 +61,7 @@ def connect(source: int | str, size: tuple[int, int] | None, timing: StreamTimin
     return Connected(capture, live=False)
 
 
-def list_connected() -> list[str]:
+def list_webcams() -> list[str]:
     """List the connected webcams, a line each; opened only where the system does not list them."""
     if sys.platform == "linux":
         return list_sysfs_webcams(_SYSFS)
@@ -76,7 +76,7 @@ def list_connected() -> list[str]:
 
 
 def list_sysfs_webcams(sysfs: Path) -> list[str]:
-    """As `list_connected`, from Linux's sysfs, with missing permissions. A camera's further nodes carry no pictures."""
+    """As `list_webcams`, from Linux's sysfs, with missing permissions. A camera's further nodes carry no pictures."""
     lines = []
     for node in sorted(sysfs.glob("video*"), key=lambda node: (len(node.name), node.name)):
         with contextlib.suppress(OSError):

@@ -46,36 +46,33 @@ class PageState:
     size: tuple[int, int] | None = None
 
 
+@dataclass(eq=False)
 class PageConnection(Generic[Facts]):
-    """One connection of a page. The device's thread sends requests, the server's stores the answers."""
+    """One connection of a page. The device's thread sends requests, the server's stores the answers.
 
-    def __init__(
-        self,
-        condition: threading.Condition,
-        name: str,
-        window: str,
-        facts: Facts,
-        send: Send,
-        answer_s: float = ANSWER_S,
-    ) -> None:
-        self.window, self.facts = window, facts
-        self.send = send
-        self.answer_s = answer_s
-        self.changes = 0  # of what it reported since it connected
-        self.refused, self.gone = "", ""
-        self.published: Any = None
-        self._condition, self._name = condition, name
-        self._number = 0
-        self._answer: tuple[Done, bytes] | None = None
+    ``changes`` of what it reported since it connected; ``refused``, ``gone``: why it cannot be the device, or is lost.
+    """
+
+    condition: threading.Condition
+    name: str
+    window: str
+    facts: Facts
+    send: Send
+    answer_s: float = ANSWER_S
+    changes: int = 0
+    refused: str = ""
+    gone: str = ""
+    published: Any = None
+    _number: int = 0
+    _answer: tuple[Done, bytes] | None = None
 
     def request(self, op: str, payload: bytes = b"", timeout_s: float | None = None, **fields: Any) -> bytes:
         """Send a request, wait until the page reports it done, and return what came with the answer.
 
         Raises DeviceError within `timeout_s`, None: within `answer_s`.
         """
-        if timeout_s is None:
-            timeout_s = self.answer_s
-        with self._condition:
+        timeout_s = self.answer_s if timeout_s is None else timeout_s
+        with self.condition:
             self._number += 1
             self.check()
             self.send(encode_message({"op": op, "number": self._number, **fields}, payload))
@@ -85,14 +82,14 @@ class PageConnection(Generic[Facts]):
                 remaining_s = end - time.monotonic()
                 if remaining_s <= 0:
                     raise DeviceError(
-                        f"{self._name} did not answer within {timeout_s:g} s: look whether its window is covered, "
+                        f"{self.name} did not answer within {timeout_s:g} s: look whether its window is covered, "
                         "its computer asleep, or the network down"
                     )
-                self._condition.wait(remaining_s)
+                self.condition.wait(remaining_s)
             done, content = self._answer
             self._answer = None
             if done.why:
-                raise DeviceError(f"{self._name} failed, {done.why}: reload it")
+                raise DeviceError(f"{self.name} failed, {done.why}: reload it")
             return content
 
     def check(self) -> None:
@@ -108,6 +105,11 @@ class PageConnection(Generic[Facts]):
 class PageChannel(ABC, Generic[Facts]):
     """Connects a device to its page. Every method may be called from any thread; only `wait_ready` waits."""
 
+    hello: type
+    """The page's first message, a struct of `window`, `take` and `facts`; `window` is the same after a reload, `take`:
+    it requests to be the device."""
+    report: type
+    """Message of the page that its `facts` have changed."""
     name: str
     """Of the page, to start a sentence with."""
     remedy: str
@@ -119,14 +121,6 @@ class PageChannel(ABC, Generic[Facts]):
         self._page: PageConnection[Facts] | None = None
 
     # what kinds of pages differ in
-
-    @abstractmethod
-    def _read_hello(self, message: str | bytes) -> tuple[str, bool, Facts]:
-        """Return the window, whether it requests to be the device, and what it reports. Raises InputError."""
-
-    @abstractmethod
-    def _read_message(self, message: str | bytes) -> tuple[Done, bytes] | Facts:
-        """Return an answer and what came with it, or what the page reports. Raises InputError."""
 
     @abstractmethod
     def _refuse(self, facts: Facts) -> str:
@@ -175,20 +169,22 @@ class PageChannel(ABC, Generic[Facts]):
         """Connect the page that sent `hello`; None where another window is the device. Raises InputError for an
         invalid message.
         """
-        window, take, facts = self._read_hello(hello)
+        first = self._decode(hello, self.hello)
         with self._condition:
             before = self._page
             if before is not None:
-                if window != before.window and not take:
+                is_same = first.window == before.window
+                if not is_same and not first.take:
                     return None
-                self._end_connection(
-                    before,
-                    f"{self.name} was reloaded, or connected anew"
-                    if window == before.window
-                    else f"another window was made {self.name}",
+                reloaded, replaced = (
+                    f"{self.name} was reloaded, or connected anew",
+                    f"another window was made {self.name}",
                 )
+                self._end_connection(before, reloaded if is_same else replaced)
                 before.send(None)
-            page = self._page = PageConnection(self._condition, self.name, window, facts, send, self._answer_s)
+            page = self._page = PageConnection(
+                self._condition, self.name, first.window, first.facts, send, self._answer_s
+            )
             self._publish_state()
             return page
 
@@ -227,6 +223,11 @@ class PageChannel(ABC, Generic[Facts]):
         if (page.refused, state) != page.published:
             page.published = page.refused, state
             page.send(encode_message({"op": "stand", "refused": page.refused, **fields}))
+
+    def _read_message(self, message: str | bytes) -> tuple[Done, bytes] | Facts:
+        """Return an answer and what came with it, or what the page reports. Raises InputError."""
+        incoming = self._decode(message, self.report | Done)
+        return (incoming, b"") if isinstance(incoming, Done) else incoming.facts
 
     def _decode(self, message: str | bytes, kind: Any) -> Any:
         """Decode a JSON message of the page as `kind`. Raises InputError for an invalid one."""

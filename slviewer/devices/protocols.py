@@ -4,10 +4,10 @@ A device belongs to the thread that opened it. Every method raises `DeviceError`
 open or was unplugged; after that, `close` and `open` are the way back, and `close` never raises.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Literal, Protocol, runtime_checkable
+from typing import Literal, Protocol, get_args, runtime_checkable
 
 import numpy as np
 
@@ -44,37 +44,29 @@ class Camera(Protocol):
     @property
     def name(self) -> str:
         """The operator's name for it, to start a sentence with, such as "the simulated camera"."""
-        ...
 
     @property
     def size(self) -> tuple[int, int]:
         """(width, height) px of its frames."""
-        ...
 
     @property
     def dtype(self) -> np.dtype:
         """uint8 or uint16."""
-        ...
 
     def open(self) -> None:
         """Claim the device; opening it twice is an error, opening it again after `close` is not."""
-        ...
 
     def close(self) -> None:
         """Release the device; nothing happens when it is not open."""
-        ...
 
     def grab(self, out: np.ndarray) -> None:
         """Fill `out` (h, w) of `dtype` with a frame exposed after the projector last reported "shown"."""
-        ...
 
     def settings(self) -> CameraSettings:
         """Read the current settings from the device."""
-        ...
 
     def apply(self, settings: CameraSettings) -> CameraSettings:
         """Apply the settings, and return those in effect: the nearest that the device supports."""
-        ...
 
 
 @runtime_checkable
@@ -83,7 +75,6 @@ class ColourCamera(Camera, Protocol):
 
     def grab_colour(self) -> np.ndarray:
         """Grab a new (h, w, 3) RGB frame of `dtype`, exposed as `grab` requires."""
-        ...
 
 
 _SETTING_TOLERANCE = 0.1
@@ -130,6 +121,19 @@ Channel = Literal["red", "green", "blue", "grey"]
 """What a colour camera decodes; green has the most pixels under a Bayer mosaic, and the most light of most lamps."""
 
 
+def check_channel(channel: str) -> None:
+    """Raise InputError unless `channel` is one of `Channel`."""
+    if channel not in get_args(Channel):
+        raise InputError(f"no channel is called {channel!r}: use one of {', '.join(get_args(Channel))}")
+
+
+def check_image_size(what: str, size: Sequence[int], most_px: int = 2**16) -> tuple[int, int]:
+    """Return the (width, height) px of `what`, a camera or a projector. Raises InputError for anything else."""
+    if len(size) != 2 or not all(isinstance(side, int) and 0 < side <= most_px for side in size):
+        raise InputError(f"{size!r} is not the size of a {what}: give its width and height in px, such as [1280, 720]")
+    return size[0], size[1]
+
+
 def extract_channel(rgb: np.ndarray, channel: Channel, out: np.ndarray) -> None:
     """Fill `out` (h, w) with one channel of (h, w, 3) RGB, or with their mean."""
     if channel == "grey":
@@ -144,35 +148,28 @@ class Projector(Protocol):
     @property
     def name(self) -> str:
         """The operator's name for it, to start a sentence with."""
-        ...
 
     @property
     def size(self) -> tuple[int, int]:
         """(width, height) px."""
-        ...
 
     def open(self) -> None:
         """Claim the device; it shows dark."""
-        ...
 
     def close(self) -> None:
         """Release the device; nothing happens when it is not open."""
-        ...
 
     def load(self, sequence: PatternSequence) -> None:
         """Load `sequence`, so that `show` is immediate; replaces the previous sequence, and shows nothing yet.
 
         Raises InputError for patterns that are not of the projector's size.
         """
-        ...
 
     def show(self, index: int) -> None:
         """Show frame `index` of the loaded sequence; returns when its light reaches the scene."""
-        ...
 
     def show_level(self, grey: int | None) -> None:
         """Show even light of grey level 0 ... 255, None for dark; returns when shown. The sequence stays loaded."""
-        ...
 
 
 class Turntable(Protocol):
@@ -184,29 +181,23 @@ class Turntable(Protocol):
     @property
     def name(self) -> str:
         """The operator's name for it, to start a sentence with."""
-        ...
 
     @property
     def limits_deg(self) -> tuple[float, float] | None:
         """The angles between which it turns; None: without end."""
-        ...
 
     @property
     def is_absolute(self) -> bool:
         """Whether it still knows its angle after it was switched off."""
-        ...
 
     def open(self) -> None:
         """Claim the device, without turning it. It keeps the angle that it stands at where it knows it, else 0."""
-        ...
 
     def close(self) -> None:
         """Stop, and release the device; nothing happens when it is not open."""
-        ...
 
     def position_deg(self) -> float:
         """Read the angle that it stands at, as far as the device knows it."""
-        ...
 
     def turn_to(self, deg: float, check: Callable[[], None] = lambda: None) -> None:
         """Turn to an angle by the way in between, of several turns too, and return when it stands still.
@@ -215,7 +206,37 @@ class Turntable(Protocol):
         outside its limits, TurntableError where it raises an alarm, stops before the angle, takes too long or was
         unplugged; it is then told to stop.
         """
-        ...
+
+
+class Openable:
+    """A device that works only while it is open; `_start` claims it."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self._open = False
+
+    def open(self) -> None:
+        """Open the device. Raises DeviceError if it is open already, or does not start; it is closed then."""
+        if self._open:
+            raise DeviceError(f"{self.name} is open already: close it first")
+        self._open = True
+        try:
+            self._start()
+        except BaseException:
+            self.close()
+            raise
+
+    def _start(self) -> None:
+        """Claim the device, which is marked as open already."""
+
+    def close(self) -> None:
+        """Close the device; nothing happens when it is not open."""
+        self._open = False
+
+    def check_open(self) -> None:
+        """Raise DeviceError unless it is open."""
+        if not self._open:
+            raise DeviceError(f"{self.name} is not open: open it before using it")
 
 
 @dataclass(frozen=True)

@@ -3,8 +3,7 @@
 import numpy as np
 
 from slviewer.devices.drivers import Driver
-from slviewer.devices.opening import Openable
-from slviewer.devices.protocols import CameraSettings, Rig, check_frame, check_index, check_level
+from slviewer.devices.protocols import CameraSettings, Openable, Rig, check_frame, check_index, check_level
 from slviewer.errors import DeviceError, InputError
 from slviewer.fringe.decode import texture
 from slviewer.fringe.sequence import PatternSequence
@@ -71,9 +70,8 @@ class ReplayProjector(Openable):
         self._loaded: tuple[np.ndarray, PatternSequence] | None = None
         self.size = recording.played[1].projector
 
-    def open(self) -> None:
-        """Open the projector: dark, nothing loaded."""
-        super().open()
+    def _start(self) -> None:
+        """Start dark, with nothing loaded."""
         self._loaded = None
         self.show_level(None)
 

@@ -8,9 +8,9 @@ import msgspec
 import numpy as np
 
 from slviewer.devices.drivers import Driver
-from slviewer.devices.opening import Openable
 from slviewer.devices.protocols import (
     CameraSettings,
+    Openable,
     Rig,
     check_angle,
     check_frame,
@@ -95,9 +95,8 @@ class SimulatedProjector(Openable):
         self._profiles: list[tuple[Axis | None, np.ndarray]] = []
         self._loads, self._shows = 0, 0
 
-    def open(self) -> None:
-        """Open the projector: dark, nothing loaded."""
-        super().open()
+    def _start(self) -> None:
+        """Start dark, with nothing loaded."""
         self._sequence = None
         self.show_level(None)
 

@@ -55,7 +55,6 @@ class SimulatedWorld:
         self,
         rig: SimulatedRig,
         board: Board | None = None,
-        shape: BoardShape = FLAT,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.rig = rig
@@ -71,7 +70,7 @@ class SimulatedWorld:
         self._table_deg = 0.0
         self._moved = self._clock()
         self._renderers: dict[bool, Renderer] = {}
-        self.print_board(board or Board.parse("circles:21x16:9"), shape)
+        self.print_board(board or Board.parse("circles:21x16:9"))
 
     @property
     def standing(self) -> Thing:

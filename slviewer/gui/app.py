@@ -26,11 +26,11 @@ from slviewer.gui.shell import Shell, greet_viewer, notify
 from slviewer.gui.viewpoints import FIELD_OF_VIEW, OVERVIEW, Viewpoints
 from slviewer.pipeline.rig_choice import set_up
 from slviewer.pipeline.rig_presets import load_rig
-from slviewer.server import viser_internals
 from slviewer.server.access import ONE_TIME_SECONDS, ROLES
 from slviewer.server.device_pages import serve_device_pages
 from slviewer.server.secure import SafeServer, Serving, serve
 from slviewer.server.viewers import Viewers
+from slviewer.server.viser_internals import ViserClient
 from slviewer.session.store import Session
 from slviewer.wizard.notices import describe_error
 from slviewer.wizard.operator import Operator
@@ -192,7 +192,7 @@ class App:
     def _greet_client(self, client: viser.ClientHandle) -> None:
         """Show a browser that may only watch that it may, and an operator's what only operators see."""
         if self.server.role(client.client_id) == "operate":
-            viser_internals.send_private_values(self.server.viser, client.client_id)
+            ViserClient(self.server.viser, client.client_id).send_private_values()
         else:
             greet_viewer(client)
 

@@ -162,9 +162,7 @@ def guess_description(
 
     Of a folder of captures, the first is read. Raises InputError where the images cannot belong to one capture.
     """
-    return guessed_description.guess_description(
-        Path(folder), None if projector is None else parse_size(projector), channel
-    )
+    return guessed_description.guess_toml(Path(folder), None if projector is None else parse_size(projector), channel)
 
 
 def _save_captures(

@@ -20,7 +20,7 @@ from slviewer.pipeline.rig_choice import COMMON_KEYS, Choice, rig_factory
 from slviewer.session.reading import expand_user, read_toml
 from slviewer.session.store import Session
 from slviewer.session.toml import to_toml
-from slviewer.simulation.assets import asset_folder
+from slviewer.simulation.assets import asset
 
 RigLike = Mapping[str, Any] | Path | str
 """A choice of devices, a TOML file that holds one, or the name of a preset."""
@@ -44,7 +44,7 @@ class Preset:
 def presets(session: Session | None = None) -> list[Preset]:
     """List the session's own rigs, then those that are shipped; a session's hides a shipped one of the same name."""
     own = {} if session is None else session.rigs()
-    shipped = {path.stem: path for path in sorted(asset_folder(FOLDER).glob("*.toml")) if path.stem not in own}
+    shipped = {path.stem: path for path in sorted(asset(FOLDER).glob("*.toml")) if path.stem not in own}
     return [_read_preset_or_problem(name, path) for name, path in {**own, **shipped}.items()]
 
 

@@ -19,7 +19,7 @@ from slviewer.preflight.recorded_capture import preflight_capture
 from slviewer.preflight.rig_under_test import SYSTEM_CLOCK, Clock, RigUnderTest
 from slviewer.preflight.screen import check_pixels, check_screen
 from slviewer.preflight.stillness import check_motion
-from slviewer.preflight.turntable import check_turntable
+from slviewer.preflight.turntable import check_turning
 from slviewer.session.store import Session
 
 
@@ -63,7 +63,7 @@ def check_rig(
                 devices.camera.apply(before)
 
 
-def check_capture(session: SessionLike, capture: str, *, progress: Progress = ignore_progress) -> Preflight:
+def check_recorded_rig(session: SessionLike, capture: str, *, progress: Progress = ignore_progress) -> Preflight:
     """Check the rig of a recorded capture from its frames: order, light, exposure, response, noise,
     description, decoded share. Raises SessionError for a capture that cannot be read, and whatever `progress` raises.
     """
@@ -144,6 +144,6 @@ def preflight(
     add(check_ambient(bench, last_dark), check_motion(bench, images, last_white))
     if rig.turntable is not None:
         tick("turning the turntable")
-        add(check_turntable(rig.turntable))
+        add(check_turning(rig.turntable))
     heard(1.0, "checked")
     return Preflight(tuple(checks), settle_ms, levels, exposure_ms, clock.now() - began)

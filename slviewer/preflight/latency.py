@@ -5,14 +5,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slviewer.pipeline.check_results import Check
+from slviewer.pipeline.check_results import Check, CheckVerdict
 from slviewer.preflight.rig_under_test import RigUnderTest
 
 _CHANGE_COUNT = 8
-_NEAR, _NEAREST = (
-    0.05,
-    0.4,
-)  # share of a change that may be missing from one that has arrived, and that may under flicker
+_NEAR, _NEAREST = 0.05, 0.4  # share of a change that may be missing from one that has arrived, and under flicker
 _TIMEOUT_S = 1.2
 _STALE_TRIALS = 3
 _LONG_MS = 250.0
@@ -42,23 +39,15 @@ def measure_latency(bench: RigUnderTest) -> tuple[Check, float | None]:
     begin_s = [bench.grab_timed()[0] for _ in range(6)]
     bench.frame_ms = 1000 * float(np.median(np.diff(begin_s)))
     changes = [_time_change(bench, i) for i in range(_CHANGE_COUNT)]
-    if not all(change.arrived for change in changes):
-        lost = sum(not change.arrived for change in changes)
-        return (
-            Check(
-                "latency",
-                "bad",
-                f"After {lost} of {_CHANGE_COUNT} changes the camera saw nothing new within {_TIMEOUT_S:g} s.",
-                "Check that the projector really changes its picture, and that the camera sends fresh images.",
-                {"changes": _CHANGE_COUNT, "unseen": lost},
-            ),
-            None,
-        )
+    lost = sum(not change.arrived for change in changes)
+    if lost:
+        sentence = f"After {lost} of {_CHANGE_COUNT} changes the camera saw nothing new within {_TIMEOUT_S:g} s."
+        remedy = "Check that the projector really changes its picture, and that the camera sends fresh images."
+        return Check("latency", "bad", sentence, remedy, {"changes": _CHANGE_COUNT, "unseen": lost}), None
     settle = _compute_settle_ms([change.arrival_ms(0) for change in changes], bench.frame_ms)
     bench.stale = max(_count_stale(bench, settle, i) for i in range(_STALE_TRIALS))
     fresh = [change.arrival_ms(bench.stale) for change in changes]
-    settle = _compute_settle_ms(fresh, bench.frame_ms)
-    bench.settle_ms = settle
+    settle = bench.settle_ms = _compute_settle_ms(fresh, bench.frame_ms)
     images = [len(change.begin_s) - 1 - bench.stale for change in changes]
     figures = {
         "latency_ms": round(max(fresh), 1),
@@ -69,29 +58,33 @@ def measure_latency(bench: RigUnderTest) -> tuple[Check, float | None]:
         "settle_ms": settle,
         "stale_images": bench.stale,
     }
+    verdict, sentence, remedy = _judge_delay(bench, max(fresh))
+    return Check("latency", verdict, sentence, remedy, figures), settle
+
+
+def _judge_delay(bench: RigUnderTest, latest_ms: float) -> tuple[CheckVerdict, str, str]:
+    """Verdict, sentence and remedy for the measured delay, whose fresh images began ``latest_ms`` late at most."""
     if bench.stale:
         many = "one image" if bench.stale == 1 else f"{bench.stale} images"
-        return (
-            Check(
-                "latency",
-                "bad",
-                f"The camera is {many} behind: it hands out images that are older than the request, however long one "
-                "waits.",
-                "Switch the camera's buffering off, or let its driver discard old images; a longer wait does not help.",
-                figures,
-            ),
-            settle,
+        sentence = (
+            f"The camera is {many} behind: it hands out images that are older than the request, however long one waits."
         )
-    if settle == 0:
+        remedy = "Switch the camera's buffering off, or let its driver discard old images; a longer wait does not help."
+        return "bad", sentence, remedy
+    if bench.settle_ms == 0:
         sentence = "Light arrives as soon as the projector reports it: the first image after each change is right."
     else:
         sentence = (
-            f"Light arrives up to {max(fresh):.0f} ms ({max(fresh) / bench.frame_ms:.1f} camera frames) after the "
-            f"projector reports the image as shown; captures wait {settle:g} ms."
+            f"Light arrives up to {latest_ms:.0f} ms ({latest_ms / bench.frame_ms:.1f} camera frames) after the "
+            f"projector reports the image as shown; captures wait {bench.settle_ms:g} ms."
         )
-    long = settle > _LONG_MS
-    remedy = "Switch the projector's picture processing off (game mode), so that captures are quicker." if long else ""
-    return Check("latency", "warning" if long else "good", sentence, remedy, figures), settle
+    if bench.settle_ms <= _LONG_MS:
+        return "good", sentence, ""
+    return (
+        "warning",
+        sentence,
+        "Switch the projector's picture processing off (game mode), so that captures are quicker.",
+    )
 
 
 def _time_change(bench: RigUnderTest, i: int) -> _Change:

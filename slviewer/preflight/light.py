@@ -9,7 +9,8 @@ from slviewer.pipeline.check_results import Check, CheckVerdict
 from slviewer.pipeline.exposure_check import CLIPPED, MUCH_CLIPPED, TOO_WEAK, WEAK
 from slviewer.preflight.rig_under_test import RigUnderTest
 
-_WHITE, _DARK = 24, 24
+_BURST = 24
+"""Images in white light, and in the dark."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,17 +28,17 @@ def capture_burst(bench: RigUnderTest) -> Burst:
 
     The bench's ``unsteady`` rises to what they show: it was measured from fewer images.
     """
-    white_s, white = _grab_images(bench, 255, _WHITE)
-    dark_s, dark = _grab_images(bench, None, _DARK)
+    white_s, white = _grab_images(bench, 255)
+    dark_s, dark = _grab_images(bench, None)
     bench.unsteady = max(bench.unsteady, bench.measure_unsteadiness(white), bench.measure_unsteadiness(dark))
     return Burst(white, dark, white_s, dark_s)
 
 
-def _grab_images(bench: RigUnderTest, grey: int | None, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Start times (n,) s and images (n, h, w) of ``count`` images under even light."""
+def _grab_images(bench: RigUnderTest, grey: int | None) -> tuple[np.ndarray, np.ndarray]:
+    """Start times (n,) s and images (n, h, w) under even light."""
     bench.show(grey, "steadiness of the light")
     bench.wait()
-    return bench.grab_spread(count)
+    return bench.grab_spread(_BURST)
 
 
 _TARGET_LEVEL = 0.85  # of full scale, for the 99.5th percentile of what is illuminated
@@ -52,7 +53,7 @@ def check_exposure(bench: RigUnderTest) -> tuple[Check, float | None]:
     black = float(np.median(bench.dark[bench.illuminated]))
     present = bench.read_exposure_ms()
     factor = _SATURATED_FACTOR if bright >= 0.985 * full else (_TARGET_LEVEL * full - black) / max(bright - black, 1.0)
-    wanted = None if present is None else _round_ms(present * factor)
+    wanted = None if present is None else float(f"{present * factor:.3g}")
     figures = {
         "bright_share_of_full_scale": round(bright / full, 3),
         "clipped_share": round(clipped, 4),
@@ -80,11 +81,6 @@ def check_exposure(bench: RigUnderTest) -> tuple[Check, float | None]:
     return Check("exposure", "good", text, "", figures), None
 
 
-def _round_ms(milliseconds: float) -> float:
-    """Milliseconds rounded to three significant digits."""
-    return float(f"{milliseconds:.3g}")
-
-
 _LEVELS = np.arange(18) * 15
 MAX_NONLINEARITY = 0.03
 """Deviation from a straight line, as a share of white, from which the response is named."""
@@ -95,17 +91,14 @@ _MAX_FLICKER = 0.02
 def check_gamma(bench: RigUnderTest) -> tuple[Check, tuple[int, ...] | None, float]:
     """Measure gamma: the check, a table for `PatternSequence.levels`, and the light of level 127.5 over white."""
     where = bench.usable()
-    if np.count_nonzero(where) < _MIN_PIXELS:
-        text = "The response cannot be measured: too few pixels are illuminated and not saturated."
-        return Check("gamma", "unknown", text, "Correct the exposure first.", {}), None, 0.5
+    if where.sum() < _MIN_PIXELS:
+        return _fail_gamma("too few pixels are illuminated and not saturated", "the exposure")
     if bench.unsteady > _MAX_FLICKER:
-        text = f"The response cannot be measured: the light flickers by {100 * bench.unsteady:.0f} %."
-        return Check("gamma", "unknown", text, "Correct the flicker first.", {}), None, 0.5
+        return _fail_gamma(f"the light flickers by {100 * bench.unsteady:.0f} %", "the flicker")
     images = [bench.grab_mean(int(level), "response to grey levels") for level in _LEVELS]
-    light = np.array([float(image[where].sum(dtype=float)) for image in images])
+    light = np.array([image[where].sum(dtype=float) for image in images])
     if light[-1] <= light[0]:
-        text = "The response cannot be measured: white is no brighter than black."
-        return Check("gamma", "unknown", text, "Correct what the other checks name first.", {}), None, 0.5
+        return _fail_gamma("white is no brighter than black", "what the other checks name")
     response = (light - light[0]) / (light[-1] - light[0])
     exponent, curved = fit_gamma(_LEVELS, response), measure_nonlinearity(_LEVELS, response)
     errors = {n: predict_phase_error(_LEVELS, response, n) for n in (3, 4, 6, 8)}
@@ -127,6 +120,12 @@ def check_gamma(bench: RigUnderTest) -> tuple[Check, tuple[int, ...] | None, flo
     )
     remedy = "Use the table that straightens it (measured just now), or 8 steps and more."
     return Check("gamma", "warning", text, remedy, figures), levels, middle
+
+
+def _fail_gamma(why: str, fault: str) -> tuple[Check, None, float]:
+    """The result of `check_gamma` where nothing can be measured, and the ``fault`` to correct before."""
+    text = f"The response cannot be measured: {why}."
+    return Check("gamma", "unknown", text, f"Correct {fault} first.", {}), None, 0.5
 
 
 _BRIGHT, _TOO_BRIGHT = 0.35, 0.8  # room over projector
@@ -167,15 +166,12 @@ def check_flicker(bench: RigUnderTest, burst: Burst) -> Check:
     where, span = bench.usable(), max(bench.contrast, 1e-6)
     if not where.any():
         return Check("flicker", "unknown", "Flicker cannot be measured: all that is illuminated is saturated.", "", {})
-    white, dark = (
-        np.array([float(i[where].mean(dtype=float)) for i in images]) for images in (burst.white, burst.dark)
-    )
-    noise = bench.noise / np.sqrt(np.count_nonzero(where)) / span
+    noise = bench.noise / np.sqrt(where.sum()) / span
     (white_rest, drift), (dark_rest, _) = (
-        _remove_drift(v / span, t) for v, t in ((white, burst.white_s), (dark, burst.dark_s))
+        _remove_drift(images[:, where].mean(axis=1, dtype=float) / span, seconds)
+        for images, seconds in ((burst.white, burst.white_s), (burst.dark, burst.dark_s))
     )
-    swing = float(np.sqrt(max(0.0, float(np.var(white_rest)) - noise**2)))
-    ambient = float(np.sqrt(max(0.0, float(np.var(dark_rest)) - noise**2)))
+    swing, ambient = (float(np.sqrt(max(0.0, np.var(rest) - noise**2))) for rest in (white_rest, dark_rest))
     present = bench.read_exposure_ms()
     hertz = _identify_mains(white_rest, burst.white_s)
     figures = {
@@ -237,6 +233,6 @@ def _identify_mains(values: np.ndarray, seconds: np.ndarray) -> int | None:
         angle = 2 * np.pi * hertz * (seconds - seconds[0])
         design = np.stack([np.cos(angle), np.sin(angle), np.ones_like(angle)], axis=1)
         rest = values - design @ np.linalg.lstsq(design, values, rcond=None)[0]
-        explained[hertz] = 1 - float(np.var(rest)) / max(float(np.var(values)), 1e-15)
+        explained[hertz] = 1 - np.var(rest) / max(np.var(values), 1e-15)
     best, other = sorted(explained, key=lambda h: -explained[h])
     return best if explained[best] > _EXPLAINS and explained[other] < explained[best] - 0.3 else None

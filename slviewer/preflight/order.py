@@ -4,13 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from slviewer.devices.capture import capture
+from slviewer.devices.capture import capture_frames
 from slviewer.devices.protocols import stated_full_scale
 from slviewer.fringe.presets import phase_steps
 from slviewer.fringe.residual import frame_residuals
 from slviewer.fringe.sequence import Frame, PatternSequence
 from slviewer.fringe.suspect import LIGHT_FAULTS
-from slviewer.pipeline.check_results import Check
+from slviewer.pipeline.check_results import Check, CheckVerdict
 from slviewer.preflight.rig_under_test import RigUnderTest
 
 _BEFORE, _AFTER = (1, 0, 0, 1, 0, 1), (0, 1, 1, 0)
@@ -31,7 +31,7 @@ def check_order(bench: RigUnderTest) -> tuple[Check, Check]:
     sequence = PatternSequence(projector, frames, full_scale=stated_full_scale(bench.rig.camera))
     bench.show(None, "order of the frames")
     bench.wait()
-    stack = capture(replace(bench.rig, settle_ms=bench.settle_ms), sequence, sleep=bench.clock.sleep)
+    stack = capture_frames(replace(bench.rig, settle_ms=bench.settle_ms), sequence, sleep=bench.clock.sleep)
     return _judge_order(bench, sequence, stack), check_repeats(sequence, stack)
 
 
@@ -42,9 +42,9 @@ def _judge_order(bench: RigUnderTest, sequence: PatternSequence, stack: np.ndarr
     shares = {
         i: bench.share(stack[i][:: bench.stride, :: bench.stride].astype(np.float32), bench.illuminated) for i in levels
     }
-    wrong = [i for i, on in levels.items() if abs(shares[i] - on) > 0.4]
-    part = max(0.08, 5 * bench.unsteady)
-    mixed = [i for i, on in levels.items() if part < abs(shares[i] - on) <= 0.4]
+    errors = {i: abs(shares[i] - on) for i, on in levels.items()}
+    wrong = [i for i, error in errors.items() if error > 0.4]
+    mixed = [i for i, error in errors.items() if max(0.08, 5 * bench.unsteady) < error <= 0.4]
     residuals = frame_residuals(sequence, stack, "x")
     # Where the light flickers, a frame that fits no step needs no other explanation.
     ignored = (*LIGHT_FAULTS, "strange") if bench.unsteady > 0.01 else LIGHT_FAULTS
@@ -54,37 +54,32 @@ def _judge_order(bench: RigUnderTest, sequence: PatternSequence, stack: np.ndarr
         "light": [round(shares[i], 3) for i in sorted(shares)],
         "misplaced_frames": sorted({*(i + 1 for i in wrong), *(s.frame + 1 for s in misplaced)}),
     }
-    lag = next((lag for lag in _LAGS if wrong and _is_lagging_by(shares, levels, lag)), 0)
-    if lag:
+    if wrong and (lag := next((lag for lag in _LAGS if _is_lagging_by(shares, levels, lag)), 0)):
         many = "one image" if lag == 1 else f"{lag} images"
-        return Check(
-            "order",
-            "bad",
-            f"Every frame is {many} late: frame k shows pattern k - {lag}.",
-            "Switch the camera's buffering off, or wait longer between showing and grabbing.",
-            figures | {"lag": lag},
-        )
+        sentence = f"Every frame is {many} late: frame k shows pattern k - {lag}."
+        remedy = "Switch the camera's buffering off, or wait longer between showing and grabbing."
+        return Check("order", "bad", sentence, remedy, figures | {"lag": lag})
+    verdict, sentence, remedy = _describe_order(n, wrong, mixed, [s.sentence for s in misplaced], residuals.message)
+    return Check("order", verdict, sentence, remedy, figures)
+
+
+def _describe_order(
+    n: int, wrong: list[int], mixed: list[int], misplaced: list[str], unknown: str
+) -> tuple[CheckVerdict, str, str]:
+    """Verdict, sentence and remedy for ``n`` frames that do not lag: indices of frames of a wrong level of light, and
+    of those that mix two; sentences on misplaced ones, and why the order cannot be proved."""
     if wrong or misplaced:
-        sentences = [s.sentence for s in misplaced] or [f"frame {wrong[0] + 1} shows the wrong level of light"]
-        sentence = "; ".join(sentences[:3])
-        return Check(
-            "order",
-            "bad",
-            f"Of {n} coded frames, {sentence}.",
-            "Check the cable and the load of the computer, wait longer between showing and grabbing, then check again.",
-            figures,
+        sentence = "; ".join(misplaced[:3]) or f"frame {wrong[0] + 1} shows the wrong level of light"
+        remedy = (
+            "Check the cable and the load of the computer, wait longer between showing and grabbing, then check again."
         )
+        return "bad", f"Of {n} coded frames, {sentence}.", remedy
     if mixed:
-        return Check(
-            "order",
-            "warning",
-            f"Frame {mixed[0] + 1} of {n} still shows part of the pattern before it.",
-            "Wait longer between showing and grabbing, or lock the camera to the projector.",
-            figures,
-        )
-    if residuals.message:
-        return Check("order", "unknown", f"The order could not be proved: {residuals.message}.", "", figures)
-    return Check("order", "good", f"All {n} coded frames came in order.", "", figures)
+        sentence = f"Frame {mixed[0] + 1} of {n} still shows part of the pattern before it."
+        return "warning", sentence, "Wait longer between showing and grabbing, or lock the camera to the projector."
+    if unknown:
+        return "unknown", f"The order could not be proved: {unknown}.", ""
+    return "good", f"All {n} coded frames came in order.", ""
 
 
 def _is_lagging_by(shares: dict[int, float], levels: dict[int, int], lag: int) -> bool:

@@ -95,14 +95,13 @@ def _check_light(fits: Sequence[FrameResiduals]) -> Check:
     known = np.array([f.light for fit in fits for f in fit.frames if np.isfinite(f.light)])
     spread = float(np.sqrt(np.mean((known - 1) ** 2))) if known.size else None
     figures = {"rms_from_frame_to_frame": None if spread is None else round(spread, 5)}
-    suspects = [s for fit in fits for s in fit.suspects if s.fault in _LIGHT_FAULTS]
+    suspects = _list_suspects(fits, _LIGHT_FAULTS)
     if suspects:
-        findings = "; ".join(dict.fromkeys(s.sentence for s in suspects[:3]))
         remedy = (
             "Lock the camera's exposure, gain and white balance; make the exposure a multiple of 10 ms (8.33 ms where "
             "the mains have 60 Hz)."
         )
-        return Check("flicker", "warning", f"{findings[0].upper()}{findings[1:]}.", remedy, figures)
+        return Check("flicker", "warning", _join_findings(suspects[:3]), remedy, figures)
     if spread is None:
         return Check("flicker", "good", "No frame is brighter or darker than the others.", "", figures)
     return Check("flicker", "good", f"The light is steady to {100 * spread:.2f} % from frame to frame.", "", figures)
@@ -110,23 +109,21 @@ def _check_light(fits: Sequence[FrameResiduals]) -> Check:
 
 def _check_ambient_light(fits: Sequence[FrameResiduals]) -> Check:
     """Check that the ambient light is constant over the frames."""
-    suspects = [s for fit in fits for s in fit.suspects if s.fault in _ROOM_FAULTS]
+    suspects = _list_suspects(fits, _ROOM_FAULTS)
     if suspects:
-        findings = "; ".join(dict.fromkeys(s.sentence for s in suspects))
         remedy = "Keep lamps, doors and daylight as they are while capturing."
-        return Check("ambient", "warning", f"{findings[0].upper()}{findings[1:]}.", remedy, {})
+        return Check("ambient", "warning", _join_findings(suspects), remedy, {})
     return Check("ambient", "good", "The light of the room did not change between the frames.", "", {})
 
 
 def _check_response(sequence: PatternSequence, frames: np.ndarray, fits: Sequence[FrameResiduals]) -> Check:
     """Check the linearity of the projector's response by the second harmonic of the fringes."""
     remedy = "Straighten the projector's response, or use more steps."
-    suspects = [s.sentence for fit in fits for s in fit.suspects if s.fault in _RESPONSE_FAULTS]
+    suspects = _list_suspects(fits, _RESPONSE_FAULTS)
     harmonics = {axis: measure_second_harmonic(sequence, frames, axis) for axis in sequence.axes}
     known = {axis: value for axis, value in harmonics.items() if np.isfinite(value)}
     if suspects:
-        findings = "; ".join(dict.fromkeys(suspects))
-        return Check("gamma", "warning", f"{findings[0].upper()}{findings[1:]}.", remedy, {})
+        return Check("gamma", "warning", _join_findings(suspects), remedy, {})
     if not known:
         why = "fewer than five phase steps, or too few pixels that see fringes"
         return Check("gamma", "unknown", f"The response cannot be measured: {why}.", "", {})
@@ -167,8 +164,7 @@ def _check_noise(sequence: PatternSequence, frames: np.ndarray, phases: Mapping[
         lines.append(f"axis {axis}: noise {noise:.2f} of {modulation:.1f} grey levels of modulation, {sigma:.3f} px")
     if not lines:
         return Check("noise", "unknown", "The noise cannot be judged: no pixel is valid.", "", {})
-    sentence = f"{'; '.join(lines)}."
-    sentence = sentence[0].upper() + sentence[1:]
+    sentence = _join_findings(lines)
     if weak:
         remedy = "Make the patterns brighter: longer exposure, wider aperture, darker room, or a nearer projector."
         return Check("noise", "warning", f"{sentence[:-1]}: near the least that is decoded.", remedy, figures)
@@ -190,11 +186,19 @@ def _check_decoded(phases: Mapping[Axis, PhaseMap]) -> Check:
         lines.append(
             f"axis {axis}: {100 * share:.1f} % of the illuminated {100 * illuminated:.1f} % of the image decode"
         )
-    sentence = "; ".join(lines)
-    sentence = f"{sentence[0].upper()}{sentence[1:]}."
+    verdict: CheckVerdict = "warning" if worst < _FEW else "good"
     if least < _LEAST_ILLUMINATED or worst < _TOO_FEW:
-        verdict: CheckVerdict = "bad"
-    else:
-        verdict = "warning" if worst < _FEW else "good"
+        verdict = "bad"
     remedy = "" if verdict == "good" else "See the picture that `slviewer decode` writes: it shows where, and why."
-    return Check("decoding", verdict, sentence, remedy, figures)
+    return Check("decoding", verdict, _join_findings(lines), remedy, figures)
+
+
+def _list_suspects(fits: Sequence[FrameResiduals], faults: Sequence[str]) -> list[str]:
+    """List the sentences of the suspects of these faults."""
+    return [suspect.sentence for fit in fits for suspect in fit.suspects if suspect.fault in faults]
+
+
+def _join_findings(findings: Sequence[str]) -> str:
+    """Join findings, each once, to a sentence."""
+    text = "; ".join(dict.fromkeys(findings))
+    return f"{text[0].upper()}{text[1:]}."

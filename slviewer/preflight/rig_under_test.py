@@ -136,5 +136,5 @@ class RigUnderTest:
 
     def share(self, image: np.ndarray, where: np.ndarray) -> float:
         """The projector's light in an image, 0 for dark, 1 for white, summed over some pixels."""
-        span = float((self.white - self.dark)[where].sum(dtype=float))
-        return float((image - self.dark)[where].sum(dtype=float)) / span if span else 0.0
+        light, span = ((each - self.dark)[where].sum(dtype=float) for each in (image, self.white))
+        return float(light / span) if span else 0.0

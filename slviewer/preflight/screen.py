@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from slviewer.devices.capture import capture
+from slviewer.devices.capture import capture_frames
 from slviewer.devices.protocols import Rig
 from slviewer.fringe.presets import phase_steps
 from slviewer.fringe.sequence import PatternSequence
@@ -79,7 +79,7 @@ def check_pixels(bench: RigUnderTest, middle: float) -> Check:
     for axis in ("x", "y"):
         sequence = PatternSequence(size, tuple(phase_steps(axis, 4, 2.0)))
         rig = Rig(bench.rig.name, bench.rig.camera, bench.rig.projector, bench.settle_ms)
-        frames = capture(rig, sequence)[:, :: bench.stride, :: bench.stride]
+        frames = capture_frames(rig, sequence)[:, :: bench.stride, :: bench.stride]
         both = (frames[0].astype(np.float32) + frames[2]) / 2  # stripes and their negative: without moire
         shares.append(bench.share(both, where))
     worst = max(shares, key=lambda share: abs(share - 0.5))

@@ -8,7 +8,7 @@ _TURN_DEG = 2.0
 _TOLERANCE_DEG = 0.2
 
 
-def check_turntable(table: Turntable) -> Check:
+def check_turning(table: Turntable) -> Check:
     """Open the turntable, turn it by 2 degrees and back, and close it."""
     figures: dict[str, float] = {}
     try:

@@ -15,6 +15,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from http import HTTPStatus
+from types import MappingProxyType
 from typing import Literal, get_args
 
 from websockets.datastructures import Headers
@@ -39,8 +40,7 @@ class Refusal(Exception):
 
     def __init__(self, status: HTTPStatus, sentence: str) -> None:
         super().__init__(sentence)
-        self.status = status
-        self.sentence = sentence
+        self.status, self.sentence = status, sentence
 
 
 class MessageRefused(Exception):
@@ -118,26 +118,19 @@ class Access:
         self._clock = clock
         self.tls = tls
         self.names = frozenset(name.lower() for name in names)
-        for token in (tokens or {}).values():
-            if not _TOKEN.fullmatch(token):
-                raise UsageError(
-                    "A token has 16 or more letters, digits, - and _: leave it out and slviewer makes one."
-                )
-        if len(set((tokens or {}).values())) < len(tokens or {}):
+        given = [] if tokens is None else list(tokens.values())
+        if not all(map(_TOKEN.fullmatch, given)):
+            raise UsageError("A token has 16 or more letters, digits, - and _: leave it out and slviewer makes one.")
+        if len(set(given)) < len(given):
             raise UsageError("Two roles have the same token: choose different ones.")
-        self._one_time: dict[str, float] = {}
         self._wrong: dict[str, list[float]] = {}
-        self.grants: dict[Role, Grant] = {}
         self.renew(tokens or {})
 
-    def renew(self, tokens: Mapping[Role, str] | None = None) -> None:
+    def renew(self, tokens: Mapping[Role, str] = MappingProxyType({})) -> None:
         """Replace all tokens, by those given, else random ones: the links given out so far open nothing any more."""
-        self._one_time = {}
-        self.grants = {
-            role: Grant(role, tokens[role], self.port, True)
-            if tokens and role in tokens
-            else Grant(role, secrets.token_urlsafe(24), self.port)
-            for role in ROLES
+        self._one_time: dict[str, float] = {}
+        self.grants: dict[Role, Grant] = {
+            role: Grant(role, tokens.get(role, secrets.token_urlsafe(24)), self.port, role in tokens) for role in ROLES
         }
 
     def issue_one_time_token(self) -> str:
@@ -204,16 +197,16 @@ class Access:
 
     def check_origin(self, headers: Headers, host: str, websocket: bool) -> None:
         """Raise Refusal if another site's page sent the request; a WebSocket must say which page opened it."""
-        origins = headers.get_all("Origin")
+        origins, site, mode, destination = map(
+            headers.get_all, ("Origin", "Sec-Fetch-Site", "Sec-Fetch-Mode", "Sec-Fetch-Dest")
+        )
         own = {f"http://{host}", f"https://{host}"}
-        if any(origin.lower() not in own for origin in origins) or (websocket and len(origins) != 1):
-            raise Refusal(HTTPStatus.FORBIDDEN, "Another page may not use this one.")
+        foreign = any(origin.lower() not in own for origin in origins) or (websocket and len(origins) != 1)
         # SameSite ignores ports, so a page of another port of this machine is detected only here. Following a link is
         # no harm: it shows the page to the person who clicked it.
-        site, mode = headers.get_all("Sec-Fetch-Site"), headers.get_all("Sec-Fetch-Mode")
-        destination = headers.get_all("Sec-Fetch-Dest")
-        foreign = any(value not in ("same-origin", "none") for value in site)
-        if foreign and not (mode == ["navigate"] and destination == ["document"]):
+        if (mode, destination) != (["navigate"], ["document"]):
+            foreign = foreign or not {*site} <= {"same-origin", "none"}
+        if foreign:
             raise Refusal(HTTPStatus.FORBIDDEN, "Another page may not use this one.")
 
     def _list_hosts(self, local_address: str) -> set[str]:

@@ -56,7 +56,7 @@ def save_tokens(path: Path, tokens: Mapping[Role, str]) -> None:
 
 
 @dataclass(frozen=True)
-class Certificate:
+class TlsCertificate:
     """A certificate with the files of its chain and its private key (PEM); `self_made`: browsers do not trust it."""
 
     chain: Path
@@ -91,7 +91,7 @@ class Certificate:
         return hashlib.sha256(ssl.PEM_cert_to_DER_cert(first)).digest().hex(":").upper()
 
 
-def self_made_certificate(host: str, names: tuple[str, ...], folder: Path | None = None) -> Certificate:
+def self_made_certificate(host: str, names: tuple[str, ...], folder: Path | None = None) -> TlsCertificate:
     """The certificate that slviewer made for itself: the same at every start, until its names or dates do not fit.
 
     Raises SlviewerError where the package cryptography is missing, and OSError where it cannot be saved.
@@ -104,7 +104,7 @@ def self_made_certificate(host: str, names: tuple[str, ...], folder: Path | None
             "certificate and its key with --tls-files."
         ) from error
     folder = folder or _config_folder()
-    certificate = Certificate(folder / "tls-certificate.pem", folder / "tls-key.pem", self_made=True)
+    certificate = TlsCertificate(folder / "tls-certificate.pem", folder / "tls-key.pem", self_made=True)
     wanted = _list_names(host, names)
     with contextlib.suppress(OSError, ValueError, x509.ExtensionNotFound):
         stored = x509.load_pem_x509_certificate(certificate.chain.read_bytes())
@@ -130,7 +130,7 @@ def _list_names(host: str, names: tuple[str, ...]) -> set[str]:
     return wanted
 
 
-def _make_certificate(certificate: Certificate, names: set[str]) -> None:
+def _make_certificate(certificate: TlsCertificate, names: set[str]) -> None:
     """Make a key and a certificate for these names, signed by itself."""
     from cryptography import x509
     from cryptography.hazmat.primitives import hashes, serialization

@@ -12,7 +12,7 @@ from urllib.parse import quote
 from websockets.datastructures import Headers
 
 from slviewer.errors import InputError
-from slviewer.server.text import safe_name
+from slviewer.server.text import safe_file_name
 
 PREFIX = "download/"
 """Of addresses, which are relative to the page: the path of the role that may fetch the file stands before it."""
@@ -39,7 +39,7 @@ class Downloads:
         `within` is the folder that it belongs to (the session's); InputError where the file is missing or, through
         links or "..", is elsewhere. It is read when it is fetched, so that the newest content arrives.
         """
-        offer = Offer(Path(path), Path(within).resolve(), safe_name(name or Path(path).name, "download"))
+        offer = Offer(Path(path), Path(within).resolve(), safe_file_name(name or Path(path).name, "download"))
         _open_offer(offer).close()
         key = secrets.token_urlsafe(16)
         self._offers[key] = offer
@@ -51,12 +51,10 @@ class Downloads:
 
     def open(self, address: str) -> tuple[Headers, BinaryIO] | None:
         """The headers and the open file for an address; None if it is not offered or no longer exists."""
-        offer = self._offers.get(address.removeprefix(PREFIX))
-        if offer is None:
-            return None
         try:
+            offer = self._offers[address.removeprefix(PREFIX)]
             file = _open_offer(offer)
-        except InputError:
+        except (KeyError, InputError):
             return None
         ascii_name = offer.name.encode("ascii", "replace").decode().replace("?", "_").replace('"', "_")
         size = os.fstat(file.fileno()).st_size

@@ -39,15 +39,15 @@ class ViserGate:
         self._server = server
         self._connection = connection
         self._role = role
-        self._client: int | None = None
+        self._client: inside.ViserClient | None = None
         self._uploads = Uploads(budget, self._forget_upload)
 
     def __call__(self, raw: Any) -> bytes | None:
         """Return the bytes of a client's message to pass on to viser; None where it is refused and dropped."""
         if self._client is None:
-            self._client = inside.client_of(self._server, self._connection)
+            self._client = inside.ViserClient.of(self._server, self._connection)
         usable = isinstance(raw, bytes) and (self._role == "operate" or len(raw) < VIEWER_LIMIT)
-        message = inside.decode(raw) if usable else None
+        message = inside.decode_message(raw) if usable else None
         if message is None or self._client is None:
             logger.debug("client %s: dropped a message that is none", self._client)
             return None
@@ -66,7 +66,7 @@ class ViserGate:
 
     def _check_message(self, message: Any, raw: bytes) -> bytes:
         """Return the bytes to pass on to viser for this message; raises MessageRefused if it is not allowed."""
-        server, client = self._server, self._client
+        client = self._client
         assert client is not None
         if type(message) not in MESSAGES[self._role]:
             raise MessageRefused("not for this link", correct=True)
@@ -80,33 +80,33 @@ class ViserGate:
                     raise MessageRefused("only an input's value can be set")
                 check_value(self._require_input(message.uuid), message.updates["value"])
             case messages.CommandTriggerMessage():
-                _check(inside.command(server, client, message.uuid) is not None)
+                _check(client.command(message.uuid) is not None)
             case messages.FileTransferStartUpload():
                 button = self._require_input(message.source_component_uuid)
                 _check(isinstance(button, viser.GuiUploadButtonHandle))
-                return inside.encode(self._uploads.start(message))
+                return inside.pack_message(self._uploads.start(message))
             case messages.FileTransferPart():
                 self._uploads.part(message)
             case messages.ScenePointerMessage():
-                _check(inside.listens_to_pointer(server, client, message.event_type))
+                _check(client.listens_to_pointer(message.event_type))
                 click = message.event_type == "click"
                 _check(len(message.screen_pos) == (1 if click else 2))
                 _check(not click or None not in (message.ray_origin, message.ray_direction))
             case messages.LocalStorageGetItemResponseMessage():
-                _check(inside.is_awaited(server, client, type(message)))
+                _check(client.is_awaited(type(message)))
             case _:
                 self._check_scene_message(message, client)
         return raw
 
-    def _check_scene_message(self, message: Any, client: int) -> None:
+    def _check_scene_message(self, message: Any, client: inside.ViserClient) -> None:
         """Raise MessageRefused unless a visible scene element listens to this message."""
-        scene = inside.scene_api(self._server, client, message.owner)
+        scene = client.scene_api(message.owner)
         _check(scene is not None)
         match message:
             case messages.TransformControlsUpdateMessage():
-                _check(inside.listens_to_gizmo(scene, client, message.name) and math.hypot(*message.wxyz) > 1e-6)
+                _check(client.listens_to_gizmo(scene, message.name) and math.hypot(*message.wxyz) > 1e-6)
             case messages.TransformControlsDragStartMessage() | messages.TransformControlsDragEndMessage():
-                _check(inside.listens_to_gizmo(scene, client, message.name))
+                _check(client.listens_to_gizmo(scene, message.name))
             case messages.SceneNodeClickMessage():
                 _check(inside.listens_to_clicks(scene, message.name))
             case _:
@@ -115,7 +115,7 @@ class ViserGate:
     def _require_input(self, uuid: str) -> Any:
         """Return the visible, enabled input with this id; raises MessageRefused otherwise."""
         assert self._client is not None
-        handle = inside.gui_input(self._server, self._client, uuid)
+        handle = self._client.gui_input(uuid)
         if handle is None:
             raise MessageRefused("nothing visible there")
         if getattr(handle, "disabled", False):
@@ -126,19 +126,18 @@ class ViserGate:
         """Notify the client that its upload was refused, or send it the true value of an input."""
         assert self._client is not None
         if isinstance(message, messages.FileTransferStartUpload):
-            inside.refuse_upload(
-                self._server, self._client, message.source_component_uuid, message.transfer_uuid, message.size_bytes
-            )
-            inside.notify(self._server, self._client, "Not uploaded", f"The file was refused: {refused}.")
+            self._client.refuse_upload(message.source_component_uuid, message.transfer_uuid, message.size_bytes)
+            self._client.show_error("Not uploaded", f"The file was refused: {refused}.")
         elif isinstance(message, messages.GuiUpdateMessage) and refused.correct:
-            handle = inside.gui_input(self._server, self._client, message.uuid)
+            handle = self._client.gui_input(message.uuid)
             if handle is not None and not (inside.is_private(handle) and self._role != "operate"):
-                inside.send_value(self._server, self._client, handle)
+                self._client.send_value(handle)
 
     def _forget_upload(self, transfer: str) -> None:
         """Let viser discard what was received of an upload, after the messages that are already waiting."""
         # viser handles what passed in tasks of its own, in their order: after those that are waiting.
-        asyncio.get_running_loop().call_soon(inside.forget_upload, self._server, self._client, transfer)
+        assert self._client is not None
+        asyncio.get_running_loop().call_soon(self._client.forget_upload, transfer)
 
 
 def _check_camera(message: messages.ViewerCameraMessage) -> None:

@@ -82,12 +82,12 @@ class HelpPages:
 
     def anchors(self, name: str) -> tuple[str, ...]:
         """Return the anchors of a page, one for each heading. Raises KeyError."""
-        return tuple(heading.anchor for heading in _list_headings(_parse(self._pages[name].read_text("utf-8"))))
+        return tuple(heading.anchor for heading in _list_headings(_parse(self._pages[name])))
 
     def _render(self, name: str) -> str:
         """Return the HTML of a page, or of the list of pages."""
         parser = _parser()
-        tokens = _parse(self._pages[name].read_text("utf-8")) if name else []
+        tokens = _parse(self._pages[name]) if name else []
         headings = _list_headings(tokens)
         openings = (token for token in tokens if token.type == "heading_open")
         for token, heading in zip(openings, headings, strict=True):
@@ -196,12 +196,12 @@ def _template() -> Any:
 @cache
 def _read_title(path: Path) -> str:
     """Return the text of a page's first heading; empty without one."""
-    return next((heading.text for heading in _list_headings(_parse(path.read_text("utf-8")))), "")
+    return next((heading.text for heading in _list_headings(_parse(path))), "")
 
 
-def _parse(text: str) -> list[Any]:
-    """Return the tokens of Markdown, without its comments."""
-    tokens: list[Any] = _parser().parse(_COMMENT.sub("", text))
+def _parse(page: Path) -> list[Any]:
+    """Return the tokens of a page's Markdown, without its comments."""
+    tokens: list[Any] = _parser().parse(_COMMENT.sub("", page.read_text("utf-8")))
     return tokens
 
 

@@ -66,17 +66,16 @@ class Listener(socket.socket):
         self._counts[accepted.group] += 1
         self._make_room()
 
-    def admit(self, peer: Any) -> None:
-        """Count the connection from this socket address no longer: it has a valid cookie."""
-        self._remove(peer)
-
     def forget(self, peer: Any) -> None:
         """Count the connection from this socket address no longer: it is closed."""
-        self._remove(peer)
+        self.admit(peer)
         self._closing.pop(peer, None)
 
-    def _remove(self, peer: Any) -> "_Accepted | None":
-        """Remove a connection from those of strangers, and return it; None where it is not among them."""
+    def admit(self, peer: Any) -> "_Accepted | None":
+        """Count the connection from this socket address, which has a valid cookie, no longer among the unauthenticated.
+
+        Returns it; None where it is not among them.
+        """
         accepted = self._strangers.pop(peer, None)
         if accepted is not None:
             self._counts[accepted.group] -= 1
@@ -88,7 +87,7 @@ class Listener(socket.socket):
         busiest, count = self._counts.most_common(1)[0]
         if count <= STRANGERS_PER_ADDRESS and len(self._strangers) <= self._max_strangers:
             return
-        oldest = self._remove(next(peer for peer, one in self._strangers.items() if one.group == busiest))
+        oldest = self.admit(next(peer for peer, one in self._strangers.items() if one.group == busiest))
         assert oldest is not None
         self._closing[oldest.peer] = time.monotonic()
         with contextlib.suppress(OSError):  # it is closed as soon as its transport reads the end

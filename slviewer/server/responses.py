@@ -13,10 +13,16 @@ HELP_POLICY = f"{_CLOSED}; style-src 'unsafe-inline'; img-src 'self'"
 """Content-Security-Policy of the documentation: nothing runs there, and only this server's pictures are shown."""
 
 
-def respond(status: HTTPStatus, body: bytes | str = b"", content_type: str = "text/plain; charset=utf-8") -> Response:
-    """A complete answer with its length."""
+def respond(
+    status: HTTPStatus,
+    body: bytes | str = b"",
+    content_type: str = "text/plain; charset=utf-8",
+    policy: str = _CLOSED,
+) -> Response:
+    """A complete answer with its length, hardened."""
     data = body.encode() if isinstance(body, str) else body
     headers = Headers({"Content-Type": content_type, "Content-Length": str(len(data))})
+    harden(headers, policy)
     return Response(status.value, status.phrase, headers, data)
 
 

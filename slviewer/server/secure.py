@@ -18,12 +18,12 @@ from slviewer.server.access import Access, Role
 from slviewer.server.auth_middleware import AuthMiddleware, DevicePage
 from slviewer.server.binding import RESOLVE_SECONDS, listen, network_address
 from slviewer.server.connection import REQUEST_SECONDS, STALL_SECONDS, Connection, quiet_logger
-from slviewer.server.credentials import Certificate, load_tokens, save_tokens, self_made_certificate
+from slviewer.server.credentials import TlsCertificate, load_tokens, save_tokens, self_made_certificate
 from slviewer.server.downloads import Downloads
 from slviewer.server.gate import ViserGate
 from slviewer.server.limits import CONNECTIONS, Admissions, limit_log, raise_descriptor_limit
-from slviewer.server.responses import script_hash
 from slviewer.server.uploads import UploadBudget
+from slviewer.server.viser_internals import ViserClient
 
 MESSAGE_LIMIT = 32 * 2**20
 """Bytes of one message from a browser; the largest is a picture that the server requested."""
@@ -67,7 +67,7 @@ class SafeServer:
     serving: Serving
     access: Access
     admissions: Admissions
-    certificate: Certificate | None
+    certificate: TlsCertificate | None
 
     @property
     def port(self) -> int:
@@ -82,8 +82,7 @@ class SafeServer:
     @property
     def shared_origin(self) -> str:
         """Scheme, host and port for other devices: the address in the network, where all addresses are open."""
-        address = ipaddress.ip_address(self._address())
-        found = network_address() if address.is_unspecified else None
+        found = network_address() if self._address.is_unspecified else None
         return self._format_origin(found or self._format_host())
 
     def link(self, role: Role = "operate", origin: str | None = None) -> str:
@@ -104,10 +103,11 @@ class SafeServer:
 
         Raises OSError where the tokens come from a file that cannot be replaced; they are replaced here nevertheless.
         """
-        leaving = viser_internals.connection_of(self.viser, client_id)
+        client = ViserClient(self.viser, client_id)
+        leaving = client.connection
         self.access.renew()
         viser_internals.call_soon(self.viser, 0.0, self.admissions.close_all, leaving)
-        viser_internals.navigate(self.viser, client_id, f"/#{self.access.issue_one_time_token()}")
+        client.navigate(f"/#{self.access.issue_one_time_token()}")
         viser_internals.call_soon(self.viser, leaving_s, self.admissions.close_all, None, leaving)
         if self.serving.token_file is not None:
             save_tokens(self.serving.token_file, {role: grant.token for role, grant in self.access.grants.items()})
@@ -115,16 +115,16 @@ class SafeServer:
     @property
     def loopback(self) -> bool:
         """Whether only this machine can reach it."""
-        return ipaddress.ip_address(self._address()).is_loopback
+        return self._address.is_loopback
 
     def role(self, client_id: int) -> Role | None:
         """The role of a client of viser, "operate" or "watch"; None once it is disconnected."""
-        connection = viser_internals.connection_of(self.viser, client_id)
+        connection = ViserClient(self.viser, client_id).connection
         return None if connection is None else connection.role
 
     def origin_of(self, client_id: int) -> str | None:
         """The origin (scheme, host, port) of a client's page, which a proxy may serve; None once disconnected."""
-        connection = viser_internals.connection_of(self.viser, client_id)
+        connection = ViserClient(self.viser, client_id).connection
         return None if connection is None else connection.request.headers["Origin"]
 
     def stop(self) -> None:
@@ -135,13 +135,14 @@ class SafeServer:
         """Scheme, host and port."""
         return f"{'https' if self.certificate else 'http'}://{host}:{self.port}"
 
-    def _address(self) -> str:
+    @property
+    def _address(self) -> ipaddress.IPv4Address | ipaddress.IPv6Address:
         """The IP address that the server listens at, without an IPv6 zone."""
-        return self.viser.get_host().partition("%")[0]
+        return ipaddress.ip_address(self.viser.get_host().partition("%")[0])
 
     def _format_host(self) -> str:
         """The host part of links: the address, in brackets for IPv6; loopback if all addresses are open."""
-        address = ipaddress.ip_address(self._address())
+        address = self._address
         if address.is_unspecified:
             return "127.0.0.1" if address.version == 4 else "[::1]"
         return f"[{address}]" if address.version == 6 else str(address)
@@ -169,7 +170,7 @@ def serve(
     tokens = {} if serving.token_file is None else load_tokens(serving.token_file)
     certificate = None
     if serving.tls_files is not None:
-        certificate = Certificate(*serving.tls_files)
+        certificate = TlsCertificate(*serving.tls_files)
     elif serving.tls:
         certificate = self_made_certificate(serving.host, serving.names)
     context = certificate.context() if certificate else None
@@ -182,17 +183,8 @@ def serve(
         admissions = Admissions(sock, connections)
         device_pages: dict[Role, DevicePage] = {}
         downloads = Downloads()
-        scripts = (*viser_internals.VISER_SCRIPTS, script_hash(viser_internals.PAGE_SCRIPT))
-        middleware = AuthMiddleware(
-            access,
-            admissions,
-            device_pages,
-            downloads,
-            viser_internals.client_page(),
-            scripts,
-            viser_internals.SUBPROTOCOL,
-            strict_transport=certificate is not None and not certificate.self_made,
-        )
+        is_trusted = certificate is not None and not certificate.self_made
+        middleware = AuthMiddleware(access, admissions, device_pages, downloads, strict_transport=is_trusted)
         budget = UploadBudget(upload_limit)
         started: list[viser.ViserServer] = []
 

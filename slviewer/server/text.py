@@ -23,7 +23,7 @@ def escape(text: str) -> str:
     return "".join(c if c.isalnum() or c == " " else f"&#{ord(c)};" for c in plain)
 
 
-def safe_name(name: str, default: str = "upload") -> str:
+def safe_file_name(name: str, default: str = "upload") -> str:
     """A file name made of the last part of `name`: no folder, no hidden file, nothing a file system would refuse.
 
     Letters of every script stay; at most 120 characters and 200 bytes, with its suffix; `default` if empty.

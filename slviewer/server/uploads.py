@@ -5,20 +5,20 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from slviewer.server.access import MessageRefused
-from slviewer.server.text import safe_name
+from slviewer.server.text import safe_file_name
 
 SMALLEST_PART = 4096
 """Bytes; viser's page sends half a megabyte at a time. Smaller parts would cost more memory than they carry."""
 
 
+@dataclass
 class UploadBudget:
-    """How many bytes of unfinished uploads the server holds for all clients together (viser keeps them in memory)."""
+    """How many bytes of unfinished uploads the server holds for all clients together (viser keeps them in memory), and
+    the ``names`` of the transfers under way: viser keeps them in one place for all clients."""
 
-    def __init__(self, limit: int) -> None:
-        self.limit = limit
-        self.used = 0
-        self.names: set[str] = set()
-        """Of the transfers under way: viser keeps them in one place for all clients."""
+    limit: int
+    used: int = 0
+    names: set[str] = field(default_factory=set)
 
 
 @dataclass
@@ -55,7 +55,7 @@ class Uploads:
             self._budget.used += size
             self._budget.names.add(message.transfer_uuid)
             self._transfers[message.transfer_uuid] = _Transfer(message.source_component_uuid, size, parts)
-        return replace(message, filename=safe_name(message.filename))
+        return replace(message, filename=safe_file_name(message.filename))
 
     def part(self, message: Any) -> None:
         """Count one part (a FileTransferPart) in; Refused, and the upload forgotten, where it was not announced."""

@@ -42,19 +42,19 @@ PAGE_SCRIPT = resources.files("slviewer.server").joinpath("page_script.js").read
 """Our script, which runs in viser's page before its own."""
 
 FROM_CLIENTS: dict[str, type[Any]] = {
-    kind.__name__: kind
-    for kind in (
-        _messages.ViewerCameraMessage,
-        _messages.GuiUpdateMessage,
-        _messages.CommandTriggerMessage,
-        _messages.FileTransferStartUpload,
-        _messages.FileTransferPart,
-        _messages.TransformControlsUpdateMessage,
-        _messages.TransformControlsDragStartMessage,
-        _messages.TransformControlsDragEndMessage,
-        _messages.SceneNodeClickMessage,
-        _messages.ScenePointerMessage,
-        _messages.LocalStorageGetItemResponseMessage,
+    name: getattr(_messages, name)
+    for name in (
+        "ViewerCameraMessage",
+        "GuiUpdateMessage",
+        "CommandTriggerMessage",
+        "FileTransferStartUpload",
+        "FileTransferPart",
+        "TransformControlsUpdateMessage",
+        "TransformControlsDragStartMessage",
+        "TransformControlsDragEndMessage",
+        "SceneNodeClickMessage",
+        "ScenePointerMessage",
+        "LocalStorageGetItemResponseMessage",
     )
 }
 """The messages that a client has reason to send; opening and closing a share tunnel is not among them."""
@@ -84,11 +84,7 @@ def start(serve: Callable[..., Any], host: str, port: int, label: str | None) ->
         server._websock_server.unregister_handler(kind)
     # A button that does nothing would be shown again by every later change of the theme.
     themed = partial(server.gui.configure_theme, show_logo=False, show_share_button=False)
-    for owner, name, value in (
-        (server, "request_share_url", _refuse_tunnel),
-        (server.gui, "configure_theme", themed),
-    ):
-        setattr(owner, name, value)
+    server.request_share_url, server.gui.configure_theme = _refuse_tunnel, themed  # type: ignore
     themed()
     return server
 
@@ -130,34 +126,123 @@ def _silence_prints() -> Iterator[None]:
         rich.print = printing
 
 
-def decode(raw: bytes) -> Message | None:
+def decode_message(raw: bytes) -> Message | None:
     """The message in these bytes with every field of its declared type; None if it is anything else."""
     try:
         fields = msgspec.msgpack.decode(raw)
         kind = FROM_CLIENTS[fields.pop("type")]
-        if not fields.keys() <= {
-            field.name for field in dataclasses.fields(kind)
-        }:  # viser fails on a field that it does not know
-            return None
-        return msgspec.convert(fields, kind)
+        known = {field.name for field in dataclasses.fields(kind)}
+        return msgspec.convert(fields, kind) if fields.keys() <= known else None  # viser fails on unknown fields
     except (msgspec.MsgspecError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
         return None
 
 
-def encode(message: Message) -> bytes:
+def pack_message(message: Message) -> bytes:
     """The bytes in which a client sends this message."""
     return msgspec.msgpack.encode({"type": type(message).__name__, **vars(message)})
 
 
-def client_of(server: viser.ViserServer, connection: object) -> int | None:
-    """The number that viser gave to the client of this connection; None before and after."""
-    live = server._websock_server._live_connections
-    return next((number for number, one in list(live.items()) if one is connection), None)
+@dataclasses.dataclass(frozen=True)
+class ViserClient:
+    """The client with a ``number`` that viser's server gave it; it may have disconnected."""
 
+    server: viser.ViserServer
+    number: int
 
-def connection_of(server: viser.ViserServer, client_id: int) -> Any:
-    """The connection of the client with this number, or None."""
-    return server._websock_server._live_connections.get(client_id)
+    def __str__(self) -> str:
+        return str(self.number)
+
+    @classmethod
+    def of(cls, server: viser.ViserServer, connection: object) -> "ViserClient | None":
+        """The client of this connection; None before and after."""
+        live = server._websock_server._live_connections
+        return next((cls(server, number) for number, one in list(live.items()) if one is connection), None)
+
+    @property
+    def connection(self) -> Any:
+        """The client's connection, or None."""
+        return self.server._websock_server._live_connections.get(self.number)
+
+    @property
+    def _handle(self) -> viser.ClientHandle | None:
+        """Viser's handle of the client; None where it is not connected."""
+        return self.server._connected_clients.get(self.number)
+
+    @property
+    def _guis(self) -> list[viser.GuiApi]:
+        """The GUI shared by all clients, and this client's own."""
+        return [self.server.gui] if self._handle is None else [self.server.gui, self._handle.gui]
+
+    def navigate(self, address: str) -> None:
+        """Let the client's page give way to another address of this server."""
+        self._queue_message(_messages.RunJavascriptMessage(f"location.replace({json.dumps(address)})"))
+
+    def send_private_values(self) -> None:
+        """Show the client the values of all private inputs."""
+        for handle in list(self.server.gui._gui_input_handle_from_uuid.values()):
+            if is_private(handle):
+                self.send_value(handle)
+
+    def gui_input(self, uuid: str) -> Any:
+        """The input with this id that the client can see, or None."""
+        candidates = (api._gui_input_handle_from_uuid.get(uuid) for api in self._guis)
+        return next((handle for handle in candidates if handle is not None and is_shown(handle)), None)
+
+    def command(self, uuid: str) -> Any:
+        """The command with this id that is not disabled, or None."""
+        candidates = (api._command_handle_from_uuid.get(uuid) for api in self._guis)
+        return next((one for one in candidates if one is not None and not (one._impl.removed or one.disabled)), None)
+
+    def scene_api(self, owner: str) -> Any:
+        """The scene that a message names by its owner: the shared one, or the client's own; None for anyone else's."""
+        if owner == "":
+            return self.server.scene
+        client = self._handle
+        return client.scene if client is not None and client.scene._owner_id == owner else None
+
+    def listens_to_gizmo(self, scene: Any, name: str) -> bool:
+        """Whether this gizmo exists and has a callback; also true while a removed one is still being dragged."""
+        if (self.number, name) in scene._active_transform_drag_handles:
+            return True
+        handle = scene._handle_from_transform_controls_name.get(name)
+        return handle is not None and bool(handle._impl_aux.update_cb) and _is_visible(scene, name)
+
+    def listens_to_pointer(self, event: str) -> bool:
+        """Whether a callback for this pointer event over the whole scene is registered."""
+        client = self._handle
+        scenes = [self.server.scene] if client is None else [self.server.scene, client.scene]
+        return any(entry.event_type == event for scene in scenes for entry in scene._scene_pointer_cb)
+
+    def is_awaited(self, kind: type[Message]) -> bool:
+        """Whether the server awaits this kind of message from the client, as the response to a request."""
+        client = self._handle
+        return client is not None and bool(client._websock_connection._incoming_handlers.get(kind))
+
+    def forget_upload(self, transfer: str) -> None:
+        """Discard the received parts of an upload."""
+        for api in self._guis:
+            api._current_file_upload_states.pop(transfer, None)
+
+    def send_value(self, handle: Any) -> None:
+        """Show the client the value that an input really has."""
+        value = handle._impl.value
+        if isinstance(value, bool | int | float | str | tuple) and not handle._impl.is_button:
+            self._queue_message(_messages.GuiUpdateMessage(handle._impl.uuid, {"value": value}))
+
+    def refuse_upload(self, source: str, transfer: str, size: int) -> None:
+        """End the progress that the client shows for an upload, and its wait for more."""
+        self._queue_message(_messages.FileTransferPartAck(source, transfer, size, size))
+        self._queue_message(_messages.RemoveNotificationMessage(f"upload-{transfer}"))
+
+    def show_error(self, title: str, body: str) -> None:
+        """Show an error to the client."""
+        if (client := self._handle) is not None:
+            client.add_notification(title=title, body=body, color="red", auto_close_seconds=10.0)
+
+    def _queue_message(self, message: Message) -> None:
+        """Queue a message for the client; nothing if it has disconnected."""
+        if (client := self._handle) is not None:
+            client._websock_connection.queue_message(message)
 
 
 def call_soon(server: viser.ViserServer, delay_s: float, function: Callable[..., Any], *args: Any) -> None:
@@ -168,11 +253,6 @@ def call_soon(server: viser.ViserServer, delay_s: float, function: Callable[...,
         loop.call_soon_threadsafe(lambda: loop.call_later(delay_s, function, *args))
 
 
-def navigate(server: viser.ViserServer, client_id: int, address: str) -> None:
-    """Let one client's page give way to another address of this server."""
-    _queue_message(server, client_id, _messages.RunJavascriptMessage(f"location.replace({json.dumps(address)})"))
-
-
 def make_private(handle: Any) -> None:
     """Send what is typed into this input to no other browser; `send_private_values` sends it to operators."""
     handle._impl.sync_cb = None
@@ -181,31 +261,6 @@ def make_private(handle: Any) -> None:
 def is_private(handle: Any) -> bool:
     """Whether `make_private` was called for this input."""
     return handle._impl.sync_cb is None and not handle._impl.is_button
-
-
-def send_private_values(server: viser.ViserServer, client_id: int) -> None:
-    """Show one client the values of all private inputs."""
-    for handle in list(server.gui._gui_input_handle_from_uuid.values()):
-        if is_private(handle):
-            send_value(server, client_id, handle)
-
-
-def gui_apis(server: viser.ViserServer, client_id: int | None) -> list[viser.GuiApi]:
-    """The GUI shared by all clients, and this client's own."""
-    client = None if client_id is None else server._connected_clients.get(client_id)
-    return [server.gui] if client is None else [server.gui, client.gui]
-
-
-def gui_input(server: viser.ViserServer, client_id: int, uuid: str) -> Any:
-    """The input with this id that the client can see, or None."""
-    candidates = (api._gui_input_handle_from_uuid.get(uuid) for api in gui_apis(server, client_id))
-    return next((handle for handle in candidates if handle is not None and is_shown(handle)), None)
-
-
-def command(server: viser.ViserServer, client_id: int, uuid: str) -> Any:
-    """The command with this id that is not disabled, or None."""
-    candidates = (api._command_handle_from_uuid.get(uuid) for api in gui_apis(server, client_id))
-    return next((one for one in candidates if one is not None and not (one._impl.removed or one.disabled)), None)
 
 
 def is_shown(handle: Any) -> bool:
@@ -231,22 +286,6 @@ def is_shown(handle: Any) -> bool:
         handle = box
 
 
-def scene_api(server: viser.ViserServer, client_id: int, owner: str) -> Any:
-    """The scene that a message names by its owner: the shared one, or the client's own; None for anyone else's."""
-    if owner == "":
-        return server.scene
-    client = server._connected_clients.get(client_id)
-    return client.scene if client is not None and client.scene._owner_id == owner else None
-
-
-def listens_to_gizmo(scene: Any, client_id: int, name: str) -> bool:
-    """Whether this gizmo exists and has a callback; also true while a removed one is still being dragged."""
-    if (client_id, name) in scene._active_transform_drag_handles:
-        return True
-    handle = scene._handle_from_transform_controls_name.get(name)
-    return handle is not None and bool(handle._impl_aux.update_cb) and _is_visible(scene, name)
-
-
 def listens_to_clicks(scene: Any, name: str) -> bool:
     """Whether a callback for clicks on this node is registered."""
     handle = scene._handle_from_node_name.get(name)
@@ -259,19 +298,6 @@ def _is_visible(scene: Any, name: str) -> bool:
     chain = ("/".join(parts[: n + 1]) for n in range(1, len(parts)))
     handles = (scene._handle_from_node_name.get(one) for one in chain)
     return all(handle is None or handle._impl.visible for handle in handles)
-
-
-def listens_to_pointer(server: viser.ViserServer, client_id: int, event: str) -> bool:
-    """Whether a callback for this pointer event over the whole scene is registered."""
-    client = server._connected_clients.get(client_id)
-    scenes = [server.scene] if client is None else [server.scene, client.scene]
-    return any(entry.event_type == event for scene in scenes for entry in scene._scene_pointer_cb)
-
-
-def is_awaited(server: viser.ViserServer, client_id: int, kind: type[Message]) -> bool:
-    """Whether the server awaits this kind of message from the client, as the response to a request."""
-    client = server._connected_clients.get(client_id)
-    return client is not None and bool(client._websock_connection._incoming_handlers.get(kind))
 
 
 def request_answer(client: viser.ClientHandle, answered: Callable[[], None]) -> None:
@@ -287,36 +313,3 @@ def request_answer(client: viser.ClientHandle, answered: Callable[[], None]) -> 
 
     connection.register_handler(kind, handle_answer)
     connection.queue_message(_messages.LocalStorageGetItemRequestMessage("slviewer", question))
-
-
-def forget_upload(server: viser.ViserServer, client_id: int | None, transfer: str) -> None:
-    """Discard the received parts of an upload."""
-    for api in gui_apis(server, client_id):
-        api._current_file_upload_states.pop(transfer, None)
-
-
-def send_value(server: viser.ViserServer, client_id: int, handle: Any) -> None:
-    """Show one client the value that an input really has."""
-    value = handle._impl.value
-    if isinstance(value, bool | int | float | str | tuple) and not handle._impl.is_button:
-        _queue_message(server, client_id, _messages.GuiUpdateMessage(handle._impl.uuid, {"value": value}))
-
-
-def refuse_upload(server: viser.ViserServer, client_id: int, source: str, transfer: str, size: int) -> None:
-    """End the progress that a client shows for an upload, and its wait for more."""
-    _queue_message(server, client_id, _messages.FileTransferPartAck(source, transfer, size, size))
-    _queue_message(server, client_id, _messages.RemoveNotificationMessage(f"upload-{transfer}"))
-
-
-def notify(server: viser.ViserServer, client_id: int, title: str, body: str) -> None:
-    """Show an error to one client."""
-    client = server._connected_clients.get(client_id)
-    if client is not None:
-        client.add_notification(title=title, body=body, color="red", auto_close_seconds=10.0)
-
-
-def _queue_message(server: viser.ViserServer, client_id: int, message: Message) -> None:
-    """Queue a message for one client; nothing if it has disconnected."""
-    client = server._connected_clients.get(client_id)
-    if client is not None:
-        client._websock_connection.queue_message(message)

@@ -8,19 +8,12 @@ _PACKAGE = Path(__file__).resolve().parent.parent
 
 
 def asset(name: str) -> Path:
-    """Path of a shipped file, such as ``rigs/webcam.toml``: beside the package in a checkout, inside it in a wheel.
+    """Path of a shipped file or folder, such as ``rigs/webcam.toml`` or ``rigs``: beside the package in a checkout,
+    inside it in a wheel.
 
     Raises `InputError` if the installation lacks it.
     """
     for folder in (_PACKAGE / "assets", _PACKAGE.parent / "assets"):
-        if (folder / name).is_file():
+        if (folder / name).exists():
             return folder / name
-    raise InputError(f"the shipped file assets/{name} is missing: install slviewer again")
-
-
-def asset_folder(name: str) -> Path:
-    """Path of a shipped folder, such as ``rigs``. Raises `InputError` if the installation lacks it."""
-    for folder in (_PACKAGE / "assets", _PACKAGE.parent / "assets"):
-        if (folder / name).is_dir():
-            return folder / name
-    raise InputError(f"the shipped folder assets/{name} is missing: install slviewer again")
+    raise InputError(f"the shipped assets/{name} is missing: install slviewer again")

@@ -19,9 +19,7 @@ def intersect(rays, origin, axes, rotation, bounds, shape):
     corner and size; shape: bow_x, bow_y, twist.
     """
     h, w = rays.shape[:2]
-    xy = np.empty((h, w, 2))
-    points = np.empty((h, w, 3))
-    normals = np.empty((h, w, 3))
+    xy, points, normals = np.empty((h, w, 2)), np.empty((h, w, 3)), np.empty((h, w, 3))
     half_x, half_y = bounds[2] / 2, bounds[3] / 2
     for i in numba.prange(h):
         for j in range(w):
@@ -50,8 +48,9 @@ def intersect(rays, origin, axes, rotation, bounds, shape):
 
 
 @kernel()
-def _albedo(x, y, bounds, kind, pitch, cells, circles, radius, mark, white, dark):
+def _albedo(x, y, bounds, sheet):
     """Albedo at one point of the board, ``white`` or ``dark``; 0 outside the plate."""
+    kind, pitch, cells, circles, radius, mark, white, dark = sheet
     px, py = x - bounds[0], y - bounds[1]
     if not (0 <= px <= bounds[2] and 0 <= py <= bounds[3]):
         return 0.0
@@ -71,12 +70,12 @@ def _albedo(x, y, bounds, kind, pitch, cells, circles, radius, mark, white, dark
 
 
 @kernel(parallel=True)
-def coverage(xy, bounds, kind, pitch, cells, circles, radius, mark, white, dark):
+def average_albedo(xy, bounds, sheet):
     """Mean albedo (h, w) float32 of each pixel; `xy` (h, w, 2) are the board coordinates of the pixels' centres.
 
-    kind: 0 blank, 1 circles (`cells` names the nearest circle for each quarter pitch; `mark` (3,) is one more, x, y and
-    radius, 0 for none), 2 chessboard (`cells` holds its
-    inner corners). A pixel whose centre and corners agree is taken as uniform; others are sampled 8x8 times.
+    sheet: kind, pitch, cells, circles, radius, mark, white, dark. kind: 0 blank, 1 circles (`cells` names the nearest
+    circle for each quarter pitch; `mark` (3,) is one more, x, y and radius, 0 for none), 2 chessboard (`cells` holds
+    its inner corners). A pixel whose centre and corners agree is taken as uniform; others are sampled 8x8 times.
     """
     h, w = xy.shape[:2]
     out = np.empty((h, w), np.float32)
@@ -89,14 +88,11 @@ def coverage(xy, bounds, kind, pitch, cells, circles, radius, mark, white, dark)
             uy = (xy[i, right, 1] - xy[i, left, 1]) / (right - left)
             vx = (xy[down, j, 0] - xy[up, j, 0]) / (down - up)
             vy = (xy[down, j, 1] - xy[up, j, 1]) / (down - up)
-            centre = _albedo(x, y, bounds, kind, pitch, cells, circles, radius, mark, white, dark)
+            centre = _albedo(x, y, bounds, sheet)
             uniform = True
             for a in (-0.5, 0.5):
                 for b in (-0.5, 0.5):
-                    corner = _albedo(
-                        x + a * ux + b * vx, y + a * uy + b * vy,
-                        bounds, kind, pitch, cells, circles, radius, mark, white, dark,
-                    )  # fmt: skip
+                    corner = _albedo(x + a * ux + b * vx, y + a * uy + b * vy, bounds, sheet)
                     uniform = uniform and corner == centre
             if uniform:
                 out[i, j] = centre
@@ -106,9 +102,6 @@ def coverage(xy, bounds, kind, pitch, cells, circles, radius, mark, white, dark)
                 a = (m + 0.5) / _SUBSAMPLES - 0.5
                 for n in range(_SUBSAMPLES):
                     b = (n + 0.5) / _SUBSAMPLES - 0.5
-                    total += _albedo(
-                        x + a * ux + b * vx, y + a * uy + b * vy,
-                        bounds, kind, pitch, cells, circles, radius, mark, white, dark,
-                    )  # fmt: skip
+                    total += _albedo(x + a * ux + b * vx, y + a * uy + b * vy, bounds, sheet)
             out[i, j] = total / (_SUBSAMPLES * _SUBSAMPLES)
     return out

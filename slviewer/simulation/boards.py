@@ -4,9 +4,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from slviewer.errors import InputError
-from slviewer.simulation.board_kernels import coverage, intersect
+from slviewer.simulation.board_kernels import average_albedo, intersect
 from slviewer.simulation.scenes import Surface
 from slviewer.target.board import Board
 from slviewer.target.mark import Mark, mark_geometry
@@ -22,6 +23,11 @@ class Pose:
     def __post_init__(self) -> None:
         if self.R.shape != (3, 3) or self.t.shape != (3,):
             raise InputError(f"a pose needs R (3, 3) and t (3,), got the shapes {self.R.shape} and {self.t.shape}")
+
+    @property
+    def matrix(self) -> np.ndarray:
+        """T_camera_board (4, 4), mm."""
+        return np.block([[self.R, self.t[:, None]], [np.zeros(3), 1.0]])
 
     def to_camera(self, points: np.ndarray) -> np.ndarray:
         """Board-frame points (..., 3) in the camera frame."""
@@ -93,7 +99,8 @@ class BoardScene:
             kind, pitch, cells = 1, self.board.pitch_mm, self._cells
         mark = np.array([self.mark.x, self.mark.y, self.mark.radius]) if self.mark else np.zeros(3)
         circles = self.features[:, :2].copy()
-        albedo = coverage(xy, bounds, kind, pitch, cells, circles, self.diameter_mm / 2, mark, self.white, self.dark)
+        sheet = kind, pitch, cells, circles, self.diameter_mm / 2, mark, self.white, self.dark
+        albedo = average_albedo(xy, bounds, sheet)
         outside = albedo == 0
         points[outside], normals[outside] = np.nan, np.nan
         return Surface(points, normals, albedo)
@@ -108,10 +115,7 @@ class BoardScene:
         assert self.board is not None
         step = self.board.pitch_mm / 4
         shape = [int(np.ceil(length / step)) for length in reversed(self.plate)]
-        j, i = np.meshgrid(np.arange(shape[1]), np.arange(shape[0]))
-        middle = np.stack([self.corner[0] + (j + 0.5) * step, self.corner[1] + (i + 0.5) * step], -1)
-        from scipy.spatial import cKDTree
-
+        middle = np.array(self.corner) + (np.moveaxis(np.indices(shape)[::-1], 0, -1) + 0.5) * step
         return cKDTree(self.features[:, :2]).query(middle)[1].astype(np.int32)
 
 
@@ -121,32 +125,26 @@ def printed_board(
     shape: BoardShape = FLAT,
     seed: int = 0,
     margin_mm: float | None = None,
-    diameter_mm: float | None = None,
     marked: bool = False,
 ) -> BoardScene:
     """Return the scene of `board` printed on a plate, `margin_mm` around its outer features (default 1.5 pitches).
 
-    `seed` draws the circles' misplacement, the same for every pose of one board. Circles are half a pitch wide unless
-    `diameter_mm` says otherwise; `marked` adds the mark of the printed sheets. Raises `InputError` for ChArUco boards,
-    which the simulation does not print.
+    `seed` draws the circles' misplacement, the same for every pose of one board. Circles are half a pitch wide;
+    `marked` adds the mark of the printed sheets. Raises `InputError` for ChArUco boards, which the simulation does not
+    print.
     """
     if board.kind not in ("circles", "acircles", "chessboard"):
         kind = "ChArUco" if board.kind == "charuco" else board.kind
         raise InputError(f"the simulation does not print {kind} boards: use circles, acircles or a chessboard")
-    diameter = (board.pitch_mm / 2 if diameter_mm is None else diameter_mm) if board.kind != "chessboard" else 0.0
-    if diameter > 0.6 * board.pitch_mm:
-        raise InputError(f"circles of {diameter:g} mm at a pitch of {board.pitch_mm:g} mm: give 0.6 pitches at most")
+    diameter = 0.0 if board.kind == "chessboard" else board.pitch_mm / 2
     margin = 1.5 * board.pitch_mm if margin_mm is None else margin_mm
-    low = board.points[:, :2].min(0) - margin
-    high = board.points[:, :2].max(0) + margin
-    size = high - low
+    low, high = board.points[:, :2].min(0) - margin, board.points[:, :2].max(0) + margin
+    corner, plate = ((float(x), float(y)) for x, y in (low, high - low))
     misplacement = np.random.default_rng([seed, 0xB0A]).normal(0, 1, (len(board.points), 2)) * shape.misplaced_mm
     if board.kind == "chessboard":
         misplacement *= 0  # its corners share edges, so that they cannot move one by one
-    return BoardScene(
-        pose, board, (float(low[0]), float(low[1])), (float(size[0]), float(size[1])), shape, misplacement, diameter,
-        mark=mark_geometry(board) if marked else None,
-    )  # fmt: skip
+    mark = mark_geometry(board) if marked else None
+    return BoardScene(pose, board, corner, plate, shape, misplacement, diameter, mark=mark)
 
 
 def blank_board(pose: Pose, size: tuple[float, float] = (220.0, 176.0), shape: BoardShape = FLAT) -> BoardScene:

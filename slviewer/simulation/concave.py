@@ -88,8 +88,7 @@ class ConcaveScene(MeshScene):
 
         Each patch is sampled at many places, so that stripes narrower than a patch are averaged rather than aliased.
         """
-        corners = self.placed[self.patches]
-        normal, _ = _normals_and_areas(corners)
+        corners, normal = self._corners, self._normals_and_areas[0]
         k = (np.arange(_SAMPLES) + 0.5) / _SAMPLES
         a, b = (each.ravel()[:, None] for each in np.meshgrid(k, k))
         weights = np.stack([(1 - a) * (1 - b), a * (1 - b), a * b, (1 - a) * b])[..., 0]  # (4, samples)
@@ -108,10 +107,23 @@ class ConcaveScene(MeshScene):
         left = place.astype(int)
         share = place - left
         out = np.zeros((len(corners), extent), np.float32)
-        patch = np.repeat(np.arange(len(corners)), weights.shape[1])
-        np.add.at(out, (patch, left.ravel()), (shade * (1 - share)).ravel())
-        np.add.at(out, (patch, left.ravel() + 1), (shade * share).ravel())
+        patch = np.arange(len(corners))[:, None]
+        np.add.at(out, (patch, left), shade * (1 - share))
+        np.add.at(out, (patch, left + 1), shade * share)
         return out
+
+    @cached_property
+    def _corners(self) -> np.ndarray:
+        """(m, 4, 3) mm: the patches' corners in the camera frame."""
+        return self.placed[self.patches]
+
+    @cached_property
+    def _normals_and_areas(self) -> tuple[np.ndarray, np.ndarray]:
+        """Unit normals (m, 3) and areas (m,) mm^2 of the patches."""
+        corners = self._corners
+        twice = np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])
+        size = np.linalg.norm(twice, axis=-1)
+        return twice / size[:, None], size / 2
 
     @cached_property
     def _form_factors(self) -> np.ndarray:
@@ -120,8 +132,7 @@ class ConcaveScene(MeshScene):
 
     def form_factors(self, chosen: np.ndarray) -> np.ndarray:
         """Return (k, m) float32 in 0 ... 1: irradiance of the vertices ``chosen`` (k,) by each patch of radiosity 1."""
-        corners = self.placed[self.patches]
-        facing, _ = _normals_and_areas(corners)
+        corners, facing = self._corners, self._normals_and_areas[0]
         out = np.zeros((len(chosen), len(corners)), np.float32)
         for first in range(0, len(chosen), _CHUNK):
             some = chosen[first : first + _CHUNK]
@@ -146,9 +157,7 @@ class ConcaveScene(MeshScene):
         light = self.indirect
         if not light.gloss:
             return np.full((1, 1), self.albedo, np.float32)
-        corners = self.placed[self.patches]
-        normal, _ = _normals_and_areas(corners)
-        middle = corners.mean(axis=1)
+        normal, middle = self._normals_and_areas[0], self._corners.mean(axis=1)
         source = _unit(rig.projector_centre - middle)
         mirrored = 2 * (source * normal).sum(-1, keepdims=True) * normal - source
         way = _unit(self.placed[:, None] - middle[None])
@@ -159,39 +168,31 @@ class ConcaveScene(MeshScene):
     @cached_property
     def _scattering(self) -> np.ndarray:
         """(n, m) float32: share of the light on a patch that leaves at a vertex, exponential in their distance."""
-        corners = self.placed[self.patches]
-        _, area = _normals_and_areas(corners)
-        distance = np.linalg.norm(self.placed[:, None] - corners.mean(axis=1)[None], axis=-1)
+        area, middle = self._normals_and_areas[1], self._corners.mean(axis=1)
+        distance = np.linalg.norm(self.placed[:, None] - middle[None], axis=-1)
         length = self.indirect.reach_mm / 2  # the mean distance of exp(-r / length) over a plane is twice its length
         return (area / (2 * np.pi * length**2) * np.exp(-distance / length)).astype(np.float32)
 
 
 def groove(
-    pose: Pose, angle_deg: float = 90.0, albedo: float = 0.8, indirect: Indirect = Indirect(),
-    width_mm: float = 60.0, length_mm: float = 90.0,
-) -> ConcaveScene:  # fmt: skip
-    """Return a V-groove: two walls of ``width_mm`` that meet at ``angle_deg`` in a fold along y, open towards -z."""
+    pose: Pose, angle_deg: float = 90.0, albedo: float = 0.8, indirect: Indirect = Indirect(), length_mm: float = 90.0
+) -> ConcaveScene:
+    """Return a V-groove: two walls 60 mm wide that meet at ``angle_deg`` in a fold along y, open towards -z."""
     if not 20 <= angle_deg <= 170:
         raise InputError(f"a groove of {angle_deg:g} degrees cannot be simulated: choose 20 to 170")
     half = np.radians(angle_deg / 2)
-    away = _graded_steps(width_mm)
+    away = _graded_steps(60.0)
     along = np.linspace(-length_mm / 2, length_mm / 2, int(np.ceil(length_mm / _COARSEST_MM)) + 1)
-    walls = [
-        (np.stack([side * away * np.sin(half), -away * np.cos(half)])[:, ::side], along) for side in (-1, 1)
-    ]  # fmt: skip
-    vertices: list[np.ndarray] = []
-    patches: list[np.ndarray] = []
-    for (x, z), y in walls:
-        grid = np.stack(np.broadcast_arrays(x[:, None], y[None], z[:, None]), axis=-1)
-        patches.append(_grid_patches(grid.shape[:2]) + sum(len(each) for each in vertices))
-        vertices.append(grid.reshape(-1, 3))
-    return _make_scene(np.concatenate(vertices), np.concatenate(patches), pose, albedo, indirect)
+    walls = []
+    for side in (-1, 1):
+        x, z = np.stack([side * away * np.sin(half), -away * np.cos(half)])[:, ::side]
+        walls.append(np.stack(np.broadcast_arrays(x[:, None], along[None], z[:, None]), axis=-1))
+    patches = _grid_patches(walls[0].shape[:2])
+    both = np.concatenate([patches, patches + walls[0].size // 3])
+    return _make_scene(np.concatenate(walls), both, pose, albedo, indirect)
 
 
-def bowl(
-    pose: Pose, radius_mm: float = 60.0, opening_deg: float = 70.0, albedo: float = 0.8,
-    indirect: Indirect = Indirect(),
-) -> ConcaveScene:  # fmt: skip
+def bowl(pose: Pose, radius_mm: float = 60.0, opening_deg: float = 70.0, albedo: float = 0.8) -> ConcaveScene:
     """Return the inside of a sphere, up to ``opening_deg`` from its deepest point, which is the origin; open to -z."""
     if not 10 <= opening_deg <= 90:
         raise InputError(f"a bowl open to {opening_deg:g} degrees cannot be simulated: choose 10 to 90")
@@ -203,16 +204,14 @@ def bowl(
     polar = np.radians(opening_deg) * np.hypot(x, y)
     share = np.where(polar > 0, np.sin(polar) / np.maximum(np.hypot(x, y), 1e-12), 0) * radius_mm
     grid = np.stack([x * share, y * share, radius_mm * (np.cos(polar) - 1)], axis=-1)
-    return _make_scene(grid.reshape(-1, 3), _grid_patches(a.shape), pose, albedo, indirect)
+    return _make_scene(grid, _grid_patches(a.shape), pose, albedo, Indirect())
 
 
-def wax(pose: Pose, size_mm: float = 90.0, relief_mm: float = 4.0, indirect: Indirect | None = None) -> ConcaveScene:
-    """Return a wavy plate of wax, in which 60 % of the light scatters, facing -z."""
-    side = np.linspace(-size_mm / 2, size_mm / 2, int(np.ceil(size_mm / 1.5)) + 1)
-    x, y = np.meshgrid(side, side, indexing="ij")
-    z = relief_mm * np.sin(2 * np.pi * x / 45) * np.cos(2 * np.pi * y / 60)
-    light = Indirect(0, scattered=0.6, reach_mm=3.0) if indirect is None else indirect
-    return _make_scene(np.stack([x, y, z], axis=-1).reshape(-1, 3), _grid_patches(x.shape), pose, 0.8, light)
+def wax(pose: Pose, indirect: Indirect = Indirect(0, scattered=0.6, reach_mm=3.0)) -> ConcaveScene:
+    """Return a wavy plate of wax of 90 mm, in which 60 % of the light scatters, facing -z."""
+    x, y = np.meshgrid(*[np.linspace(-45.0, 45.0, 61)] * 2, indexing="ij")
+    z = 4.0 * np.sin(2 * np.pi * x / 45) * np.cos(2 * np.pi * y / 60)
+    return _make_scene(np.stack([x, y, z], axis=-1), _grid_patches(x.shape), pose, 0.8, indirect)
 
 
 CONCAVE: dict[str, Callable[[Pose], ConcaveScene]] = {"groove": groove, "bowl": bowl, "wax": wax}
@@ -222,11 +221,14 @@ CONCAVE: dict[str, Callable[[Pose], ConcaveScene]] = {"groove": groove, "bowl": 
 def _make_scene(
     vertices: np.ndarray, patches: np.ndarray, pose: Pose, albedo: float, indirect: Indirect
 ) -> ConcaveScene:  # fmt: skip
-    """Return the scene of patches, each of two triangles; raises InputError for an albedo beyond 0 ... 1."""
+    """Return the scene of patches of the vertices (..., 3), each of two triangles.
+
+    Raises InputError for an albedo beyond 0 ... 1.
+    """
     if not 0 < albedo < 1:
         raise InputError(f"an albedo of {albedo:g} cannot be simulated: choose one between 0 and 1")
     triangles = np.concatenate([patches[:, [0, 1, 2]], patches[:, [0, 2, 3]]])
-    return ConcaveScene(vertices, triangles, pose, albedo, patches, indirect)
+    return ConcaveScene(vertices.reshape(-1, 3), triangles, pose, albedo, patches, indirect)
 
 
 def _graded_steps(width: float) -> np.ndarray:
@@ -242,13 +244,6 @@ def _grid_patches(shape: tuple[int, ...]) -> np.ndarray:
     index = np.arange(shape[0] * shape[1]).reshape(shape)
     corners = index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]
     return np.stack([each.ravel() for each in corners], axis=1)
-
-
-def _normals_and_areas(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return unit normals (m, 3) and areas (m,) mm^2 of patches with corners (m, 4, 3)."""
-    twice = np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])
-    size = np.linalg.norm(twice, axis=-1)
-    return twice / size[:, None], size / 2
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:

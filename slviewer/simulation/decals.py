@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -64,10 +65,9 @@ class MarkedScene:
             along, down = (np.nan_to_num(step[near] @ R[:, :2]) for step in steps)
             own = albedo[near]
             total = np.zeros_like(own)
-            for a in offsets:
-                for b in offsets:
-                    there = decal.albedo(local[near][:, :2] + a * along + b * down)
-                    total += np.where(np.isnan(there), own, there).astype(np.float32)
+            for a, b in product(offsets, offsets):
+                there = decal.albedo(local[near][:, :2] + a * along + b * down)
+                total += np.where(np.isnan(there), own, there).astype(np.float32)
             albedo[near] = total / _SAMPLES**2
         return Surface(surface.points, surface.normals, albedo)
 
@@ -87,21 +87,22 @@ def marked_sphere(pose: Pose) -> MarkedScene:
     """The Letter's sphere with six markers on its front."""
     turns = ((-25, -15), (0, -22), (25, -15), (-20, 20), (5, 22), (25, 18))
     radius = 98.0
-    decals = []
-    for i, (around, up) in enumerate(turns):
-        R = Rotation.from_euler("yx", (around, up), degrees=True).as_matrix()
-        decals.append(Decal(i, 16.0, Pose(R, R @ np.array([0.0, 0.0, -radius]))))
+    decals = [_stick_on_front(i, 16.0, turn, radius) for i, turn in enumerate(turns)]
     return MarkedScene(sphere(tuple(pose.t.tolist()), 2 * radius), pose, decals)
 
 
-def marked_cylinder(pose: Pose, radius: float = 40.0, length: float = 150.0) -> MarkedScene:
+def marked_cylinder(pose: Pose) -> MarkedScene:
     """An open cylinder about the y axis with six markers on its front."""
+    radius = 40.0
     places = ((-30, -40.0), (0, -45.0), (30, -40.0), (-25, 35.0), (5, 40.0), (30, 35.0))
-    decals = []
-    for i, (around, y) in enumerate(places):
-        R = Rotation.from_euler("y", around, degrees=True).as_matrix()
-        decals.append(Decal(i, 14.0, Pose(R, R @ np.array([0.0, 0.0, -radius]) + np.array([0.0, y, 0.0]))))
-    return MarkedScene(MeshScene(*cylinder_mesh(radius, length), pose), pose, decals)
+    decals = [_stick_on_front(i, 14.0, (around, 0), radius, y) for i, (around, y) in enumerate(places)]
+    return MarkedScene(MeshScene(*cylinder_mesh(radius, 150.0), pose), pose, decals)
+
+
+def _stick_on_front(number: int, side_mm: float, turn_deg: tuple[float, float], radius: float, y: float = 0.0) -> Decal:
+    """The marker on a front at ``radius`` from the y axis, turned about y and then x, and moved along y."""
+    R = Rotation.from_euler("yx", turn_deg, degrees=True).as_matrix()
+    return Decal(number, side_mm, Pose(R, R @ np.array([0.0, 0.0, -radius]) + np.array([0.0, y, 0.0])))
 
 
 def cylinder_mesh(radius: float, length: float) -> tuple[np.ndarray, np.ndarray]:

@@ -5,6 +5,7 @@ import numpy as np
 from scipy.special import ive, ndtri
 
 from slviewer.geometry.jit import kernel
+from slviewer.simulation.light import OVERSAMPLING
 
 _ROWS = 24  # rows per task: small enough for the cache, large enough that the PSF's overlap costs little
 
@@ -31,7 +32,7 @@ def _hash_bits(x):
 
 
 @kernel(parallel=True, fastmath=True)
-def image_light(coordinate, level, gain, table, offset, per_px, taps, stray, out):
+def image_light(coordinate, level, gain, table, offset, taps, stray, out):
     """Write the light of one frame into `out` (h, w) float32 grey levels above dark.
 
     Light gain * table(level, coordinate) is blurred by `taps` (2 r + 1) in both directions; coordinate, level and gain
@@ -40,7 +41,7 @@ def image_light(coordinate, level, gain, table, offset, per_px, taps, stray, out
     h, w = out.shape
     radius = taps.size // 2
     last = np.float32(table.shape[1] - 1.001)
-    start, scale = np.float32(offset), np.float32(per_px)
+    start, scale = np.float32(offset), np.float32(OVERSAMPLING)
     for task in numba.prange((h + _ROWS - 1) // _ROWS):
         first, end = task * _ROWS, min((task + 1) * _ROWS, h)
         blurred = np.zeros((_ROWS + 2 * radius, w), np.float32)

@@ -96,11 +96,10 @@ def hostile_light(
     level = fault.level(severity)
     rig = fault.rig(rig, level, number) if fault.rig else rig
     scene = fault.scene(scene, level, number) if fault.scene else scene
-    change = fault.pattern
-    changed = (lambda p: change(p, level)) if change else (lambda p: p)
+    change = fault.pattern or (lambda pattern, level: pattern)
     places = fault.moving(scene, level) if fault.moving else [scene]
     parts = np.array_split(np.arange(len(sequence.frames)), len(places))
-    rendered = [render_light(rig, place, sequence, changed) for place in places]
+    rendered = [render_light(rig, place, sequence, lambda pattern: change(pattern, level)) for place in places]
     light = [light[part] for (light, _), part in zip(rendered, parts, strict=True)]
     steps = [i for i, frame in enumerate(sequence.frames) if (frame.kind, frame.axis) == ("phase", "x")]
     middle = next(k for k, part in enumerate(parts) if steps[len(steps) // 2] in part)

@@ -47,17 +47,17 @@ def follow_exposure(light: np.ndarray, off: float, shot: Shot) -> np.ndarray:
     return scale_frames(light, exposure_loop_gains(light, off))
 
 
-def exposure_loop_gains(light: np.ndarray, off: float, speed: float = 0.15) -> np.ndarray:
+def exposure_loop_gains(light: np.ndarray, off: float) -> np.ndarray:
     """(n,) gains of an exposure control that starts too bright by ``off`` and follows the mean level of the last frame.
 
-    Its target is the mean level of all frames; each frame it takes this share of the way that is left.
+    Its target is the mean level of all frames; each frame it takes 15 % of the way that is left.
     """
     means = light.mean((1, 2))
     target, gain = float(means.mean()), 1 + off
     gains = []
     for mean in means:
         gains.append(gain)
-        gain *= (target / (gain * max(float(mean), 1e-3))) ** speed
+        gain *= (target / (gain * max(float(mean), 1e-3))) ** 0.15
     return np.array(gains)
 
 
@@ -197,10 +197,9 @@ def _select_indices(shot: Shot, kind: str, axis: str) -> list[int]:
 def lose_frames(frames: np.ndarray, level: float, shot: Shot) -> np.ndarray:
     """Drop a Gray frame of y (level 0), a phase step of x (1), or both (2); later frames move forward."""
     phase_x, gray_y = _select_indices(shot, "phase", "x"), _select_indices(shot, "gray", "y")
-    if level == 0:
-        return drop_frame(frames, gray_y[2])
-    frames = drop_frame(frames, phase_x[3])
-    return drop_frame(frames, gray_y[2]) if level == 2 else frames
+    if level != 0:
+        frames = drop_frame(frames, phase_x[3])
+    return frames if level == 1 else drop_frame(frames, gray_y[2])
 
 
 def repeat_frames(frames: np.ndarray, level: float, shot: Shot) -> np.ndarray:
@@ -227,9 +226,9 @@ def exchange_axis_frames(frames: np.ndarray, level: float, shot: Shot) -> np.nda
 def reverse_bits(frames: np.ndarray, level: float, shot: Shot) -> np.ndarray:
     """Gray bits in reverse order: of x (level 0), of both axes (1), of both with the complementary one (2)."""
     for axis in ("x",) if level == 0 else ("x", "y"):
-        places = _select_indices(shot, "gray", axis) + (
-            _select_indices(shot, "complementary", axis) if level == 2 else []
-        )
+        places = _select_indices(shot, "gray", axis)
+        if level == 2:
+            places += _select_indices(shot, "complementary", axis)
         frames = show_instead(frames, places, places[::-1])
     return frames
 

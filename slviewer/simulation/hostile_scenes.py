@@ -30,14 +30,13 @@ class SceneGroup:
 
     def trace(self, rays: np.ndarray) -> Surface:
         """Return the nearest surface of all scenes along each ray."""
-        first, *others = (scene.trace(rays) for scene in self.scenes)
-        points, normals, albedo = first.points.copy(), first.normals.copy(), first.albedo.copy()
+        nearest, *others = (scene.trace(rays) for scene in self.scenes)
         for surface in others:
+            z = surface.points[..., 2]
             with np.errstate(invalid="ignore"):
-                nearer = np.isfinite(surface.points[..., 2]) & ~(points[..., 2] <= surface.points[..., 2])
-            points[nearer], normals[nearer] = surface.points[nearer], surface.normals[nearer]
-            albedo[nearer] = surface.albedo[nearer]
-        return Surface(points, normals, albedo)
+                is_nearer = np.isfinite(z) & ~(nearest.points[..., 2] <= z)
+            nearest = nearest.overlay(surface, is_nearer)
+        return nearest
 
     def occluded(self, points: np.ndarray, source: np.ndarray) -> np.ndarray:
         """Whether any of the scenes blocks the way from a point to the source."""
@@ -71,12 +70,10 @@ class DirtyBoard:
         for _ in range(round(40 * self.share * 10)):  # scratches: lines of cells
             start, way = rng.uniform(0, 1, 2) * shape, rng.normal(size=2)
             line = start + np.arange(rng.integers(10, 40))[:, None] * way / np.linalg.norm(way)
-            line = np.clip(line.astype(int), 0, shape - 1)
-            dirty[line[:, 0], line[:, 1]] = True
-        cells = np.clip(cells, 0, shape - 1)
+            dirty[tuple(np.clip(line.astype(int), 0, shape - 1).T)] = True
         albedo = surface.albedo.copy()
-        albedo[hit] = np.where(dirty[cells[:, 0], cells[:, 1]], self.left, 1.0) * albedo[hit]
-        return Surface(surface.points, surface.normals, albedo.astype(np.float32))
+        albedo[hit] *= np.where(dirty[tuple(np.clip(cells, 0, shape - 1).T)], self.left, 1.0)
+        return Surface(surface.points, surface.normals, albedo)
 
     def occluded(self, points: np.ndarray, source: np.ndarray) -> np.ndarray:
         """Return whether points are shaded, as for the clean board."""
@@ -105,11 +102,9 @@ class MirrorTable:
         with np.errstate(invalid="ignore"):
             behind = image.points @ self.normal > self.offset_mm
         visible = ~direct & behind & np.isfinite(image.points[..., 2])
-        points, normals, albedo = surface.points.copy(), surface.normals.copy(), surface.albedo.copy()
         M, shift = _compute_reflection(self.normal, self.offset_mm)
-        points[visible], normals[visible] = image.points[visible] @ M.T + shift, image.normals[visible] @ M.T
-        albedo[visible] = np.float32(self.reflectivity) * image.albedo[visible]
-        return Surface(points, normals, albedo)
+        albedo = np.float32(self.reflectivity) * image.albedo
+        return surface.overlay(Surface(image.points @ M.T + shift, image.normals @ M.T, albedo), visible)
 
     def is_direct(self, rays: np.ndarray) -> np.ndarray:
         """Return the pixels (h, w) bool that see the object itself, and not its mirror image."""
@@ -201,8 +196,7 @@ def refocus_camera(rig: SimulatedRig, share: float, number: int) -> SimulatedRig
 
 def drift_projector(rig: SimulatedRig, mrad: float, number: int) -> SimulatedRig:
     """The rig with its projector turned a little in each capture, by ``mrad`` over eight, as a warming mount does."""
-    turn = rotation(1e-3 * mrad * min(number, 8) / 8 * np.array([0.6, 0.7, 0.4]))
-    return replace(rig, R=turn @ rig.R, t=turn @ rig.t)
+    return knock_projector(rig, mrad * min(number, 8) / 8, number)
 
 
 def knock_projector(rig: SimulatedRig, mrad: float, number: int) -> SimulatedRig:
@@ -216,7 +210,7 @@ def flex_board(scene: Scene, bow_mm: float, number: int) -> Scene:
     if not isinstance(scene, BoardScene):
         return scene
     bow = bow_mm * np.random.default_rng([number, 0xF1]).uniform(-1, 1, 3)
-    return replace(scene, shape=BoardShape(float(bow[0]), float(bow[1]), float(bow[2])))
+    return replace(scene, shape=BoardShape(*bow.tolist()))
 
 
 def moving_scenes(scene: Scene, by_mm: float) -> list[Scene]:
@@ -234,8 +228,8 @@ def put_on_table(scene: Scene, reflectivity: float, number: int) -> Scene:
     """The scene on a polished table 3 mm below the object, which mirrors it."""
     if isinstance(scene, BoardScene):
         (x, y), (width, height) = scene.corner, scene.plate
-        corners = np.array([(x + a * width, y + b * height, 0.0) for a in (0, 1) for b in (0, 1)])
-        lowest = scene.pose.to_camera(corners)[:, 1].max()
+        corners = [(x + a * width, y + b * height, 0.0) for a in (0, 1) for b in (0, 1)]
+        lowest = scene.pose.to_camera(np.array(corners))[:, 1].max()
     elif isinstance(scene, Spheres):
         lowest = scene.centres[:, 1].max() + scene.radius_mm
     else:

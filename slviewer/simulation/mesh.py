@@ -10,7 +10,7 @@ from slviewer.errors import InputError
 from slviewer.registration.open3d_loader import open3d
 from slviewer.simulation.assets import asset
 from slviewer.simulation.boards import Pose
-from slviewer.simulation.scenes import Surface
+from slviewer.simulation.scenes import Surface, directions_of
 
 _LIFT_MM = 0.02  # shadow rays start this far above the surface: Open3D casts in float32, 1e-4 mm at these depths
 
@@ -40,13 +40,12 @@ class MeshScene:
     def trace(self, rays: np.ndarray) -> Surface:
         """Return the first triangle that each ray meets; back faces are ignored."""
         shape = rays.shape[:2]
-        directions = np.concatenate([rays, np.ones((*shape, 1))], -1)
         index, uvs = self.cast(rays)
         hit = index >= 0
         corners = self.triangles[index[hit]]
         a, b, c = (self.placed[corners[:, k]] for k in range(3))
         flat = np.cross(b - a, c - a)
-        along = directions[hit]
+        along = directions_of(rays)[hit]
         facing = (flat * along).sum(-1)
         points = along * ((flat * a).sum(-1) / facing)[:, None]
         s, t = uvs[hit].T[..., None]
@@ -61,13 +60,11 @@ class MeshScene:
 
     def cast(self, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return (h, w) int: the triangle, of either side, that each ray meets, -1 for none; (h, w, 2): where on it."""
-        directions = np.concatenate([rays, np.ones((*rays.shape[:2], 1))], -1)
+        directions = directions_of(rays)
         origin_and_way = np.concatenate([np.zeros_like(directions), directions], -1).astype(np.float32)
-        hits = self._caster.cast_rays(open3d().core.Tensor(origin_and_way))
-        met = np.isfinite(hits["t_hit"].numpy())
-        return np.where(met, hits["primitive_ids"].numpy().astype(np.int64), -1), hits["primitive_uvs"].numpy().astype(
-            float
-        )
+        cast = self._caster.cast_rays(open3d().core.Tensor(origin_and_way))
+        distance, index, uv = (cast[name].numpy() for name in ("t_hit", "primitive_ids", "primitive_uvs"))
+        return np.where(np.isfinite(distance), index.astype(np.int64), -1), uv.astype(float)
 
     def occluded(self, points: np.ndarray, source: np.ndarray) -> np.ndarray:
         """Return whether the mesh is between `points` and `source`."""

@@ -10,10 +10,11 @@ from scipy.sparse import csr_matrix
 
 from slviewer.errors import InputError
 from slviewer.fringe.patterns import profile
+from slviewer.fringe.presets import AXES
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.simulation.concave import ConcaveScene
 from slviewer.simulation.film import NORMAL_QUANTILES, digitise, image_light, psf_taps
-from slviewer.simulation.light import OVERSAMPLING, blur_levels, blurred_profile, window
+from slviewer.simulation.light import blur_levels, blurred_profile, window
 from slviewer.simulation.rig import SimulatedRig
 from slviewer.simulation.scenes import Scene
 
@@ -86,8 +87,8 @@ class Renderer:
         lamp = 1 + rig.light.flicker * rng.standard_normal(len(sequence.frames))
         width, height = rig.camera.size
         stack = np.empty((len(sequence.frames), height, width), np.uint8)
-        for k in range(len(stack)):
-            self.frame(profile(sequence, k), keys[k], stack[k], lamp=lamp[k])
+        for k, frame in enumerate(stack):
+            self.frame(profile(sequence, k), keys[k], frame, lamp=lamp[k])
             if progress is not None:
                 progress(k + 1, len(stack))
         return stack
@@ -120,7 +121,8 @@ class Renderer:
     ) -> np.ndarray:
         """(h, w) float32: the light of one frame in grey levels above dark, before noise and clipping; as `frame`."""
         rig, maps, (varies, grey_levels) = self.rig, self._maps, pattern
-        illuminated, stray = self._light(self.exposure if exposure is None else exposure)
+        exposure = self.exposure if exposure is None else exposure
+        illuminated, stray = self._light(exposure)
         # Rows and columns are blurred alike in space, hence by different numbers of pixels.
         sigmas = maps.sigmas * (self._rows_per_column if varies == "y" else 1.0)
         light_levels = (grey_levels / 255.0) ** rig.light.gamma
@@ -129,13 +131,11 @@ class Renderer:
         out = np.empty((height, width), np.float32)
         image_light(
             maps.coordinates[varies or "x"], maps.level, illuminated, np.float32(lamp) * light.table, light.offset,
-            OVERSAMPLING, self._taps, stray, out,
+            self._taps, stray, out,
         )  # fmt: skip
         if isinstance(self.scene, ConcaveScene):
-            profile_light = (1 - rig.light.black) * light_levels
-            out += np.float32(lamp * (self.exposure if exposure is None else exposure)) * self._indirect_light(
-                varies or "x", profile_light
-            )
+            indirect = self._indirect_light(varies or "x", (1 - rig.light.black) * light_levels)
+            out += np.float32(lamp * exposure) * indirect
         return out
 
     def _indirect_light(self, axis: Axis, profile_light: np.ndarray) -> np.ndarray:
@@ -159,23 +159,21 @@ class Renderer:
 
     def room_light(self) -> np.ndarray:
         """(h, w) float32: grey levels of even room light as strong as full white light from the projector."""
-        even = self._maps.even * np.float32(self.exposure)
+        return self._blur(self._maps.even * np.float32(self.exposure))
+
+    def _blur(self, light: np.ndarray) -> np.ndarray:
+        """Return light on the maps, blurred by the camera's PSF, within the frame (h, w)."""
         for direction in (0, 1):
-            even = correlate1d(even, self._taps, axis=direction)
-        return np.ascontiguousarray(even[self._frame])
+            light = correlate1d(light, self._taps, axis=direction)
+        return np.ascontiguousarray(light[self._frame])
 
     def _light(self, exposure: float) -> tuple[np.ndarray, np.ndarray]:
         """Grey levels: of full white light as `_Maps.gain`, and of all that no pattern changes, blurred, (h, w)."""
         if exposure not in self._lights:
             maps, black = self._maps, self.rig.light.black
-            stray = exposure * (black * maps.gain + self.rig.light.ambient * maps.even)
-            for direction in (0, 1):
-                stray = correlate1d(stray, self._taps, axis=direction)
+            stray = self._blur(exposure * (black * maps.gain + self.rig.light.ambient * maps.even))
             self._lights.clear()  # an exposure is kept for many frames
-            self._lights[exposure] = (
-                (exposure * (1 - black) * maps.gain).astype(np.float32),
-                np.ascontiguousarray(stray[self._frame], np.float32),
-            )
+            self._lights[exposure] = (exposure * (1 - black) * maps.gain).astype(np.float32), stray.astype(np.float32)
         return self._lights[exposure]
 
     @cached_property
@@ -237,11 +235,9 @@ class Renderer:
             even=(reflected * hit).astype(np.float32),
             level=level,
             sigmas=sigmas,
-            coordinates={"x": _replace_nonfinite(u), "y": _replace_nonfinite(v)},
+            coordinates={
+                axis: np.nan_to_num(place, posinf=0.0, neginf=0.0).astype(np.float32)
+                for axis, place in zip(AXES, (u, v), strict=True)
+            },
             truth=Truth(surface.points[self._frame], projector[self._frame], (hit & reached & inside)[self._frame]),
         )
-
-
-def _replace_nonfinite(values: np.ndarray) -> np.ndarray:
-    """The values as contiguous float32 with 0 for NaN and infinity."""
-    return np.ascontiguousarray(np.nan_to_num(values, nan=0.0, posinf=0.0, neginf=0.0), np.float32)

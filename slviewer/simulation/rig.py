@@ -94,11 +94,8 @@ def letter(
         for name, stream in zip(("camera", "projector"), streams[:2], strict=True)
     )
     R, t = _compute_arrangement(np.random.default_rng(streams[2]), preset["arrangement"])
-    light = Illumination(**preset["light"])
-    if gamma is not None:
-        light = dataclasses.replace(light, gamma=gamma)
-    if flicker is not None:
-        light = dataclasses.replace(light, flicker=flicker)
+    given = {name: value for name, value in (("gamma", gamma), ("flicker", flicker)) if value is not None}
+    light = Illumination(**preset["light"] | given)
     camera = dataclasses.replace(camera, scale=scale)
     return SimulatedRig(camera, projector, R, t, Sensor(**preset["sensor"]), light, seed)
 

@@ -22,17 +22,28 @@ class Surface:
     normals: np.ndarray
     albedo: np.ndarray
 
+    def overlay(self, other: "Surface", where: np.ndarray) -> "Surface":
+        """Return the surface with the pixels ``where`` (h, w) bool of another one."""
+        return Surface(
+            np.where(where[..., None], other.points, self.points),
+            np.where(where[..., None], other.normals, self.normals),
+            np.where(where, other.albedo, self.albedo),
+        )
+
 
 class Scene(Protocol):
     """Protocol of scenes that can be rendered."""
 
     def trace(self, rays: np.ndarray) -> Surface:
         """What the camera rays (h, w, 2) = (x/z, y/z) meet."""
-        ...
 
     def occluded(self, points: np.ndarray, source: np.ndarray) -> np.ndarray:
         """(n,) bool: the way from `points` (n, 3) on the surface to `source` (3,) is blocked."""
-        ...
+
+
+def directions_of(rays: np.ndarray) -> np.ndarray:
+    """(h, w, 3): the directions (x/z, y/z, 1) of rays (h, w, 2)."""
+    return np.concatenate([rays, np.ones((*rays.shape[:2], 1))], -1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +60,7 @@ class Spheres:
 
     def trace(self, rays: np.ndarray) -> Surface:
         """The nearer intersection with the nearest sphere."""
-        directions = np.concatenate([rays, np.ones((*rays.shape[:2], 1))], -1)
+        directions = directions_of(rays)
         squared = (directions**2).sum(-1)
         depth = np.full(rays.shape[:2], np.inf)
         normals = np.full(directions.shape, np.nan)

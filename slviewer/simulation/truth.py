@@ -8,11 +8,11 @@ import numpy as np
 from slviewer.errors import InputError
 from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis
-from slviewer.simulation.boards import BoardScene, Pose
+from slviewer.simulation.boards import BoardScene
 from slviewer.simulation.lens import SimulatedLens
 from slviewer.simulation.mesh import MeshScene
 from slviewer.simulation.rig import SimulatedRig
-from slviewer.simulation.scenes import Scene, Spheres
+from slviewer.simulation.scenes import Scene, Spheres, directions_of
 
 
 def rig_record(rig: SimulatedRig) -> dict[str, Any]:
@@ -34,17 +34,15 @@ def scene_record(scene: Scene) -> dict[str, Any]:
         return {
             "shape": "plane",
             "board": str(scene.board) if scene.board else None,
-            "T_camera_board": _format_matrix(scene.pose),
-            "bow_x_mm": scene.shape.bow_x_mm,
-            "bow_y_mm": scene.shape.bow_y_mm,
-            "twist_mm": scene.shape.twist_mm,
+            "T_camera_board": scene.pose.matrix.tolist(),
+            **{name: getattr(scene.shape, name) for name in ("bow_x_mm", "bow_y_mm", "twist_mm")},
             "corner_mm": list(scene.corner),
             "plate_mm": list(scene.plate),
         }
     if isinstance(scene, Spheres):
         return {"shape": "sphere", "centres": scene.centres.tolist(), "radius_mm": scene.radius_mm}
     if isinstance(scene, MeshScene):
-        return {"shape": "mesh", "T_camera_object": _format_matrix(scene.pose)}
+        return {"shape": "mesh", "T_camera_object": scene.pose.matrix.tolist()}
     raise InputError(f"a scene of type {type(scene).__name__} has no record: use a board, spheres or a mesh")
 
 
@@ -58,13 +56,6 @@ def _lens_record(lens: SimulatedLens) -> dict[str, Any]:
         "scale": s,
         "waves": lens.waves.tolist(),
     }
-
-
-def _format_matrix(pose: Pose) -> list[list[float]]:
-    """The pose as a nested list (4, 4), mm."""
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = pose.R, pose.t
-    return T.tolist()
 
 
 _STEPS = 12
@@ -89,12 +80,11 @@ class PerfectModel:
         """(h, w, 3) float32 mm: where the rig's own lenses put each phase; NaN where it is invalid."""
         row = self.axes.index(phase.axis)
         valid = phase.mask
-        rays = np.dstack([self.rig.camera.rays(), np.ones(phase.phase.shape)])[valid]
+        rays = directions_of(self.rig.camera.rays())[valid]
         measured = phase.coordinate[valid].astype(float)
         # In 1/z the coordinate is nearly linear, so that secants need few steps.
         nearer, inverse = np.full(len(rays), 1 / 500), np.full(len(rays), 1 / 700)
-        before = self._project_depths(rays, nearer, row) - measured
-        off = before
+        off = before = self._project_depths(rays, nearer, row) - measured
         for _ in range(_STEPS):
             off = self._project_depths(rays, inverse, row) - measured
             going = np.abs(off) > _SETTLED_PX

@@ -47,7 +47,7 @@ def stone_on_table() -> MeshScene:
     """The stone as it is first on the turntable, and a square table below its foot that the camera sees around it."""
     scene = turning(1)["turn_01"]
     a, n = _TABLE_MM, len(scene.vertices)
-    corners = np.array([(-a, -a, -_FOOT_MM), (a, -a, -_FOOT_MM), (a, a, -_FOOT_MM), (-a, a, -_FOOT_MM)])
+    corners = np.array([(x, y, -_FOOT_MM) for x, y in ((-a, -a), (a, -a), (a, a), (-a, a))])
     table = np.array([(0, 1, 2), (0, 2, 3)], np.int32)
     return MeshScene(
         np.concatenate([scene.vertices, corners]), np.concatenate([scene.triangles, n + table]), scene.pose

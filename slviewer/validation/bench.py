@@ -16,7 +16,7 @@ from slviewer.calibration.pixelwise import PixelFit, PixelwiseModel, calibrate_p
 from slviewer.calibration.splined.compiled import DEPTHS, GRID_CELLS_ACROSS, CompiledAxis
 from slviewer.calibration.splined.model import SplinedModel
 from slviewer.calibration.stereo import StereoModel
-from slviewer.evaluation.render import render
+from slviewer.evaluation.render import Row, render
 from slviewer.fringe import kernels_coded, kernels_levels
 from slviewer.fringe.decode import code_rules, decode, grey_scale, pack_levels, pack_shifts
 from slviewer.fringe.layout import axis_layout
@@ -33,6 +33,7 @@ from slviewer.pipeline.poses import load_observations
 from slviewer.pipeline.simulate import TARGET, simulate
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.reconstruction.onepass import OnePass
+from slviewer.records.plain import to_plain
 from slviewer.session import atomic
 from slviewer.session.ply import write_ply
 from slviewer.session.store import Session
@@ -56,7 +57,6 @@ from slviewer.validation.bench_scaling import time_scaling
 from slviewer.validation.bench_wizard import time_wizard
 
 PERIOD_PX = 18.0
-Row = dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ class Benchmark:
     def to_json(self) -> dict[str, Any]:
         """Return the rows as plain values."""
         figures = {"stages": self.rows, "peak_memory_gb": self.peak_memory_gb, "missing": list(self.missing)}
-        return figures if self.live is None else figures | {"live": self.live.to_json()}
+        return figures if self.live is None else figures | {"live": to_plain(self.live)}
 
     def text(self) -> str:
         """Return a table for the terminal."""
@@ -115,14 +115,17 @@ def bench(
     frames = renderer.capture(sequence)
     rendering = median(lambda: renderer.capture(sequence), 3) / len(frames)
     size = f"{frames.shape[2]}x{frames.shape[1]}"
-    rows = [row(f"render one frame, {size}", rendering, frames[0].nbytes / 1e6, most_s=0.015)]
+    rows = [row(f"render one frame, {size}", rendering, frames[0].nbytes / 1e6, target=0.015)]
     progress(0.1, "decoding")
-    decoding, kernel = _time_decoding(sequence, frames)
-    rows += decoding
+    defined = median(lambda: decode_reference(sequence, frames, "x"), 1, warm=False)
+    stage = f"decode {len(frames) - 1} frames"
+    note = "phase, wrapped phase, modulation, background and reason, in arrays made before"
+    decoding, kernel = _time_decoding(stage, sequence, frames, note, defined)
+    rows += [*decoding, row(f"{stage}, NumPy definition", defined)]
     progress(0.2, "measuring")
     rows += _time_measuring(sequence, frames)
     progress(0.3, "live")
-    rows += _time_live(rig, renderer)
+    rows.append(_time_live(rig, renderer))
     progress(0.35, "peers")
     peers, absent = _time_peers(rig, renderer, kernel)
     memory = None
@@ -143,24 +146,20 @@ def _peak_memory() -> float | None:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1e9 if sys.platform == "darwin" else 1e6)
 
 
-def _time_decoding(sequence: PatternSequence, frames: np.ndarray) -> tuple[list[Row], float]:
-    """Rows of decoding phase steps and Gray code, and the seconds of the kernel alone."""
+def _time_decoding(
+    stage: str, sequence: PatternSequence, frames: np.ndarray, note: str, definition: float | None = None
+) -> tuple[list[Row], float]:
+    """Rows of decoding with the kernel alone and as a whole, and the seconds of the kernel.
+
+    ``definition``: seconds of the NumPy definition, where it is compared.
+    """
     coded = frames[:-1]  # without the texture
     kernel, moved, least = _time_with_floor(_time_kernel_alone(sequence, frames), coded, 0, (1, 4, 0))
     whole = median(lambda: decode(sequence, frames, "x"), 5)
-    defined = median(lambda: decode_reference(sequence, frames, "x"), 1, warm=False)
-    alone = "phase, wrapped phase, modulation, background and reason, in arrays made before"
+    target = None if definition is None else (1.7 * kernel, "1.7 kernels")
     return [
-        row(f"decode {len(coded)} frames, kernel", kernel, moved, least, note=alone),
-        row(
-            f"decode {len(coded)} frames",
-            whole,
-            definition=defined,
-            note="with the noise, spikes and new arrays",
-            target="1.7 kernels",
-            most_s=1.7 * kernel,
-        ),
-        row(f"decode {len(coded)} frames, NumPy definition", defined),
+        row(f"{stage}, kernel", kernel, moved, least, note=note),
+        row(stage, whole, definition=definition, note="with the noise, spikes and new arrays", target=target),
     ], kernel
 
 
@@ -196,7 +195,7 @@ def _time_measuring(sequence: PatternSequence, frames: np.ndarray) -> list[Row]:
     rows.append(_time_one_pass(OnePass(sequence, _make_splined(compiled, rays), "x"), frames, 5))
     rows += gpu_rows(sequence, pixelwise, frames)
     rows.append(row("second pass, over spikes", median(lambda: one.repair_spikes(scan), 9), megabytes(scan.phase)))
-    rows.append(row("noise and fringe mean of a capture, sampled", median(lambda: one.light(frames), 5), most_s=1e-3))
+    rows.append(row("noise and fringe mean of a capture, sampled", median(lambda: one.light(frames), 5), target=1e-3))
     return [*rows, *_time_files(scan.cloud(), sequence, frames)]
 
 
@@ -207,7 +206,7 @@ def _time_one_pass(one: OnePass, frames: np.ndarray, numbers: int) -> Row:
     seconds, moved, least = _time_with_floor(lambda: one.sweep(frames, light, scan), frames, numbers, (2, 3, 1))
     note = "frames to phase, points, depth noise, modulation and texture; spikes not repaired"
     stage = f"one pass over {len(frames)} frames, {one.model.name}"
-    return row(stage, seconds, moved, least, note=note, most_floors=1.3)
+    return row(stage, seconds, moved, least, note=note, target=(1.3 * least, "1.3 floors"))
 
 
 def _time_with_floor(
@@ -222,39 +221,28 @@ def _time_with_floor(
     return seconds, megabytes(frames, values, grey, single, triple), least
 
 
-def _time_live(rig: SimulatedRig, renderer: Renderer) -> list[Row]:
+def _time_live(rig: SimulatedRig, renderer: Renderer) -> Row:
     """The row of a live scan: recorded frames of axis x to arrays in one fused pass of the pixel-wise model."""
     sequence = one_axis(multifrequency(rig.projector.size, 4), "x")
-    frames = np.ascontiguousarray(renderer.capture(sequence)[: len(sequence.frames)])
+    frames = renderer.capture(sequence)
     pixelwise, _, _ = _make_calibrations(frames.shape[1:])
     one = OnePass(sequence, pixelwise, "x")
     scan = one.run(frames)
     seconds = median(lambda: one.run(frames, scan.light, scan), 15)
-    count = len(frames) - 1
-    return [
-        row(
-            f"live: {count} recorded frames to arrays",
-            seconds,
-            note=f"{1 / seconds:.0f} clouds/s",
-            target="60 clouds/s",
-            most_s=1 / 60,
-        )
-    ]
+    note = f"{1 / seconds:.0f} clouds/s"
+    return row(f"live: {len(frames) - 1} recorded frames to arrays", seconds, note=note, target=(1 / 60, "60 clouds/s"))
 
 
 def _time_peers(rig: SimulatedRig, renderer: Renderer, coded: float) -> tuple[list[Row], tuple[str, ...]]:
     """Rows of other programs, and of registration; ``coded`` seconds took our kernel for phase steps and Gray code."""
     rows: list[Row] = []
-    absent = tuple(text for text in (missing("fringes"), missing("small-gicp")) if text)
+    absent = tuple(filter(None, map(missing, ("fringes", "small-gicp"))))
     if not missing("fringes"):
         sequence = one_axis(multifrequency(rig.projector.size, 6), "x")
         frames = renderer.capture(sequence)
         count, size = len(frames) - 1, (frames.shape[2], frames.shape[1])
-        ours, moved, least = _time_with_floor(_time_kernel_alone(sequence, frames), frames[:-1], 0, (1, 4, 0))
         note = "absolute and wrapped phase, modulation, background and reason, in arrays made before"
-        rows.append(row(f"decode {count} frames of three periods, kernel", ours, moved, least, note=note))
-        whole = median(lambda: decode(sequence, frames, "x"), 5)
-        rows.append(row(f"decode {count} frames of three periods", whole, note="with the noise, spikes and new arrays"))
+        rows, ours = _time_decoding(f"decode {count} frames of three periods", sequence, frames, note)
         rows += [fringes_row(25, size, coded), fringes_row(count, size, ours)]
     return rows + registration_rows(), absent
 
@@ -271,17 +259,14 @@ def _time_calibration(scale: float, progress: Progress) -> list[Row]:
             shot = store.load_capture(next(iter(stereo.poses)))
             splined = load_model(store, "splined")
             assert isinstance(splined, SplinedModel)
-            passed = _time_one_pass(
-                OnePass(one_axis(shot.sequence, "x"), splined, "x"),
-                shot.stack()[: len(one_axis(shot.sequence, "x").frames)],
-                5,
-            )
+            only_x = one_axis(shot.sequence, "x")
+            passed = _time_one_pass(OnePass(only_x, splined, "x"), shot.stack()[: len(only_x.frames)], 5)
         fit, held = _time_fit(observations, stereo)
     note = f"steps 2 to 5, both axes, phases in memory; at most {held:.2f} GB beside them"
     return [
-        row(f"pixel-wise fit of {len(observations)} poses", fit, note=note, most_s=5.0),
+        row(f"pixel-wise fit of {len(observations)} poses", fit, note=note, target=5.0),
         passed,
-        row("calibrate 25 recorded poses, both axes, all default models", whole, most_s=25.0),
+        row("calibrate 25 recorded poses, both axes, all default models", whole, target=25.0),
     ]
 
 
@@ -330,14 +315,19 @@ def _time_files(cloud: Cloud, sequence: PatternSequence, frames: np.ndarray) -> 
         )
         content = path.read_bytes()
         with Session.create(Path(folder, "session")) as session:
-            saved = median(
-                lambda: session.save_capture("scan_01", "scan", sequence, frames, source="simulated", force=True), 3
-            )
+            save = partial(session.save_capture, "scan_01", "scan", sequence, frames, source="simulated", force=True)
+            saved = median(save, 3)
         copies = [median(partial(atomic.replace_file, plain, data), 3) for data in (content, frames.tobytes())]
     points = f"{np.count_nonzero(mask) / 1e6:.2f} M points"
     return [
-        row(f"write {points} as PLY", exported, len(content) / 1e6, copies[0], most_floors=1.5),
-        row(f"save a capture of {len(frames)} frames", saved, megabytes(frames), copies[1], most_floors=1.5),
+        row(f"write {points} as PLY", exported, len(content) / 1e6, copies[0], target=(1.5 * copies[0], "1.5 floors")),
+        row(
+            f"save a capture of {len(frames)} frames",
+            saved,
+            megabytes(frames),
+            copies[1],
+            target=(1.5 * copies[1], "1.5 floors"),
+        ),
     ]
 
 

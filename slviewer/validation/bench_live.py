@@ -8,9 +8,8 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import msgspec
 import numpy as np
@@ -69,10 +68,6 @@ class LiveFigures:
     growth_mb: float | None
     growth_files: float | None
     growth_threads: float | None
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the figures by name."""
-        return asdict(self)
 
     def text(self) -> str:
         """Return the figures as lines for the terminal."""
@@ -145,17 +140,15 @@ def _measure(operator: Operator, server: SafeServer, seconds: float, progress: P
     if first_uses and last_uses and not np.isnan(used[0][1]).any():
         growth = (np.median(last_uses, axis=0) - np.median(first_uses, axis=0)).tolist()
     return LiveFigures(
-        size=camera,
-        seconds=seconds,
-        captures_per_s=(then - first) / halfway,
-        captures_per_s_stalled=(captures - then) / (time.monotonic() - begun - halfway),
-        clouds_per_s=statistics.median(made),
-        shown_per_s=statistics.median(shown),
-        latency_ms=statistics.median(behind) if behind else float("nan"),
-        points=points,
-        growth_mb=growth[0],
-        growth_files=growth[1],
-        growth_threads=growth[2],
+        camera,
+        seconds,
+        (then - first) / halfway,
+        (captures - then) / (time.monotonic() - begun - halfway),
+        statistics.median(made),
+        statistics.median(shown),
+        statistics.median(behind) if behind else float("nan"),
+        points,
+        *growth,
     )
 
 
@@ -261,10 +254,8 @@ def _measure_use() -> tuple[float, float, float]:
     import resource
 
     try:
-        pages, files = (
-            int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1]),
-            len(list(Path("/proc/self/fd").iterdir())),
-        )
+        pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
+        files = len(list(Path("/proc/self/fd").iterdir()))
     except OSError:
         return (float("nan"),) * 3
     return pages * resource.getpagesize() / 1e6, files, threading.active_count()

@@ -1,22 +1,26 @@
 """Rows of the benchmark: timing, memory floors, a CUDA device, and other programs."""
 
+import os
 import statistics
+import subprocess
+import sys
 from collections.abc import Callable
 from importlib.metadata import PackageNotFoundError, version
 from timeit import repeat, timeit
-from typing import Any
 
 import numpy as np
 from numba import prange
 
 from slviewer.calibration.pixelwise import PixelwiseModel
 from slviewer.calibration.splined.model import SplinedModel
+from slviewer.evaluation.render import Row
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.geometry import cuda_device
 from slviewer.geometry.jit import kernel
 from slviewer.geometry.rigid import Floats, move_points, turn_about
 from slviewer.reconstruction.onepass import LightLevels
 from slviewer.reconstruction.onepass_cuda import CudaPass
+from slviewer.registration.pairwise import register
 
 
 def row(
@@ -25,20 +29,17 @@ def row(
     megabytes: float | None = None,
     floor: float | None = None,
     definition: float | None = None,
+    *,
     note: str = "",
-    target: str = "",
-    most_s: float | None = None,
-    most_floors: float | None = None,
-) -> dict[str, Any]:
+    target: float | tuple[float, str] | None = None,
+) -> Row:
     """One row of the table; ``floor`` and ``definition`` in seconds, for the ratios.
 
-    ``most_s``: target of the seconds, and ``most_floors`` of their ratio to the floor, on two cores at 1600x1200;
-    ``target`` states it in another unit than milliseconds.
+    ``target``: the most seconds on two cores at 1600x1200, and how the table states them where not in milliseconds.
     """
-    if floor is not None and most_floors is not None:
-        most_s, target = most_floors * floor, target or f"{most_floors:g} floors"
-    elif most_s is not None:
-        target = target or (f"{1e3 * most_s:g} ms" if most_s < 1.0 else f"{most_s:g} s")
+    most_s, text = target if isinstance(target, tuple) else (target, "")
+    if most_s is not None:
+        text = text or (f"{1e3 * most_s:g} ms" if most_s < 1.0 else f"{most_s:g} s")
     return {
         "stage": stage,
         "ms": 1e3 * seconds,
@@ -46,7 +47,7 @@ def row(
         "floor ms": None if floor is None else 1e3 * floor,
         "ratio to floor": None if floor is None else seconds / floor,
         "ratio NumPy / kernel": None if definition is None else definition / seconds,
-        "target": target,
+        "target": text,
         "holds": "" if most_s is None or seconds != seconds else "yes" if seconds <= most_s else "no",
         "note": note,
     }
@@ -56,7 +57,8 @@ def time_beside(work: Callable[[], object], floor: Callable[[], object], times: 
     """Least seconds of some work and of its floor, run in turns, which lessens the share of other programs."""
     work(), floor()  # compiled, and in the caches
     seconds = [(timeit(work, number=1), timeit(floor, number=1)) for _ in range(times)]
-    return min(each[0] for each in seconds), min(each[1] for each in seconds)
+    least, least_floor = map(min, zip(*seconds, strict=True))
+    return least, least_floor
 
 
 def median(work: Callable[[], object], times: int, warm: bool = True) -> float:
@@ -70,6 +72,12 @@ def fastest(work: Callable[[], object], times: int) -> float:
     """Least seconds, after a first run that is not counted."""
     work()
     return min(repeat(work, number=1, repeat=times))
+
+
+def run_python(*arguments: str, **environment: str) -> str:
+    """Run Python in a process of its own; returns its output, and raises CalledProcessError where it fails."""
+    command, changed = [sys.executable, *arguments], {**os.environ, **environment}
+    return subprocess.run(command, check=True, capture_output=True, text=True, env=changed).stdout
 
 
 def megabytes(*arrays: np.ndarray) -> float:
@@ -117,7 +125,7 @@ def gpu_rows(
     frames: np.ndarray,
     times: int = TIMES,
     ahead: int = AHEAD,
-) -> list[dict[str, Any]]:
+) -> list[Row]:
     """One pass over frames (n, h, w) of axis x: the kernel alone, then a whole cloud, repaired, with copies there and
     back; nothing without a device."""
     name = cuda_device.find_device()
@@ -151,7 +159,7 @@ def _time_kernel(
     card.load(frames)
     source, target = (cuda.device_array(card.bytes_moved // 2, np.uint8) for _ in range(2))
     marks = [cuda.event() for _ in range(3)]
-    durations: list[tuple[float, float]] = []
+    durations = []
     for _ in range(times):
         for _ in range(ahead):
             target.copy_to_device(source, stream=card.stream)
@@ -180,7 +188,7 @@ def missing(package: str) -> str:
     return ""
 
 
-def fringes_row(frames: int, size: tuple[int, int], ours: float) -> dict[str, Any]:
+def fringes_row(frames: int, size: tuple[int, int], ours: float) -> Row:
     """Decoding by `fringes` of as many frames of (width, height), shared among three periods; ``ours`` seconds took our
     kernel. It makes its arrays itself: brightness and modulation of each period, and coordinates."""
     from fringes import Fringes
@@ -188,9 +196,7 @@ def fringes_row(frames: int, size: tuple[int, int], ours: float) -> dict[str, An
     width, height = size
     coder = Fringes()
     coder.X = coder.Y = 912
-    coder.D = 1
-    coder.K = 3
-    coder.v = [1, 8, 57]
+    coder.D, coder.K, coder.v = 1, 3, [1, 8, 57]
     coder.N = [frames // 3 + (i < frames % 3) for i in range(3)]
     levels = np.random.default_rng(0).integers(0, 256, (int(coder.T), height, width)).astype(np.uint8)
     seconds = fastest(lambda: coder.decode(levels), 3)
@@ -198,21 +204,19 @@ def fringes_row(frames: int, size: tuple[int, int], ours: float) -> dict[str, An
     return row(f"decode {len(levels)} frames, fringes {version('fringes')}", seconds, note=note)
 
 
-def registration_rows() -> list[dict[str, Any]]:
+def registration_rows() -> list[Row]:
     """Aligning two noisy clouds of one relief, 1.4 M points each, 4 degrees and 5 mm apart: ours, then `small-gicp`."""
-    from slviewer.registration.pairwise import register
-
     (points, normals), (moved, moved_normals) = _make_relief(0, 0.0), _make_relief(1, 0.037)
     truth = turn_about(np.radians(4.0) * np.array([1.0, 0.5, 2.0]) / 2.29, moved.mean(0), np.array([3.0, -3.0, 2.6]))
     start = np.linalg.inv(truth).astype(np.float64)
     moved, moved_normals = move_points(truth, moved), moved_normals @ truth[:3, :3].T
     count = f"{len(points) / 1e6:.2f} M points"
 
-    def error_um(T: Floats) -> str:
-        """State the largest error of an alignment (4, 4) over the scan, in um."""
+    def time_alignment(stage: str, align: Callable[[], Floats], note: str, target: float | None = None) -> Row:
+        """The row of an alignment (4, 4), with its largest error over the scan, in um."""
         few = moved[::997]
-        worst = np.linalg.norm(move_points(T, few) - move_points(start, few), axis=1).max()
-        return f"{1e3 * worst:.1f} um off"
+        worst = np.linalg.norm(move_points(align(), few) - move_points(start, few), axis=1).max()
+        return row(stage, median(align, 3), target=target, note=f"{1e3 * worst:.1f} um off, {note}")
 
     def ours() -> np.ndarray:
         """Align by the program's registration, with its checks of the result."""
@@ -220,7 +224,7 @@ def registration_rows() -> list[dict[str, Any]]:
             moved, points, scan_normals=moved_normals, reference_normals=normals, initial=np.eye(4)
         ).T_reference_scan
 
-    rows = [row(f"align {count}", median(ours, 3), most_s=0.6, note=f"{error_um(ours())}, with checks of the result")]
+    rows = [time_alignment(f"align {count}", ours, "with checks of the result", 0.6)]
     if missing("small-gicp"):
         return rows
     import small_gicp
@@ -238,8 +242,8 @@ def registration_rows() -> list[dict[str, Any]]:
             ).T_target_source
         )
 
-    note = f"{error_um(theirs())}, generalised ICP, voxels of 0.5 mm, two threads, without checks of the result"
-    return [*rows, row(f"align {count}, small-gicp {version('small-gicp')}", median(theirs, 3), note=note)]
+    note = "generalised ICP, voxels of 0.5 mm, two threads, without checks of the result"
+    return [*rows, time_alignment(f"align {count}, small-gicp {version('small-gicp')}", theirs, note)]
 
 
 def _make_relief(seed: int, shift_mm: float) -> tuple[np.ndarray, np.ndarray]:

@@ -1,7 +1,6 @@
 """How time and memory grow with pixels, target poses, scans merged and captures of a session."""
 
 import shutil
-import subprocess
 import sys
 import tempfile
 import tracemalloc
@@ -18,7 +17,7 @@ from slviewer.calibration.splined.model import calibrate_splined
 from slviewer.calibration.stereo import calibrate_stereo
 from slviewer.fringe.decode import decode
 from slviewer.fringe.presets import p18
-from slviewer.fringe.sequence import PatternSequence, one_axis
+from slviewer.fringe.sequence import one_axis
 from slviewer.pipeline.batch import batch
 from slviewer.pipeline.capture_phases import decode_frames, texture_8bit
 from slviewer.pipeline.feedback import Progress, ignore_progress
@@ -33,7 +32,7 @@ from slviewer.simulation.rig import SimulatedRig, letter
 from slviewer.simulation.turning import STEPS, turning
 from slviewer.target.board import Board
 from slviewer.validation.bench_live import true_calibration
-from slviewer.validation.bench_rows import median, row
+from slviewer.validation.bench_rows import Row, median, row, run_python
 from slviewer.wizard.planner import Planner
 from slviewer.wizard.session_reader import SessionReader
 from slviewer.wizard.snapshot import RigView
@@ -55,25 +54,25 @@ SLOW_S = 1.0
 """What takes longer is measured once."""
 LINEAR = 1.1
 """Largest exponent that counts as linear."""
-Row = dict[str, Any]
 
 
 def time_scaling(progress: Progress = ignore_progress) -> list[Row]:
     """Rows of each size, with the largest memory of its arrays, and of each kind the exponent of its growth."""
-    progress(0.0, "pixels")
     rig = letter(SCALE)
     plan = letter_plan(rig, poses=max(POSES))
-    rows = _time_pixels(rig, plan["pose_01"])
-    progress(0.2, "captures of a session")
-    rows += _time_captures(rig, plan["pose_01"])
-    progress(0.3, "scans")
-    rows += _time_scans(rig)
-    progress(0.5, "reading poses")
-    rows += _time_poses(rig, plan)
-    progress(0.8, "whole captures")
-    rows += _time_whole_captures(plan["pose_01"])
-    progress(0.95, "batches")
-    rows += _time_batches(plan["pose_01"])
+    scene = plan["pose_01"]
+    stages: dict[str, tuple[float, Callable[[], list[Row]]]] = {
+        "pixels": (0.0, lambda: _time_pixels(rig, scene)),
+        "captures of a session": (0.2, lambda: _time_captures(rig, scene)),
+        "scans": (0.3, lambda: _time_scans(rig)),
+        "reading poses": (0.5, lambda: _time_poses(rig, plan)),
+        "whole captures": (0.8, lambda: _time_whole_captures(scene)),
+        "batches": (0.95, lambda: _time_batches(scene)),
+    }
+    rows: list[Row] = []
+    for name, (done, work) in stages.items():
+        progress(done, name)
+        rows += work()
     progress(1.0, "measured")
     return rows
 
@@ -126,7 +125,7 @@ def _time_pixels(rig: SimulatedRig, scene: Any, megapixels: tuple[float, ...] = 
 def _time_captures(rig: SimulatedRig, scene: Any, counts: tuple[float, ...] = CAPTURES) -> list[Row]:
     """Rows of the wizard's snapshot of a session with so many captures."""
     with tempfile.TemporaryDirectory(prefix="slviewer-bench-") as folder:
-        sequence = PatternSequence(rig.projector.size, one_axis(p18(rig.projector.size), "x").frames)
+        sequence = one_axis(p18(rig.projector.size), "x")
         frames = Renderer(rig, scene).capture(sequence)
         with Session.open_or_create(Path(folder, "session")) as session:
             first = session.save_capture("pose_001", "calibration", sequence, frames, source="simulated", board=TARGET)
@@ -144,14 +143,14 @@ def _time_captures(rig: SimulatedRig, scene: Any, counts: tuple[float, ...] = CA
     return rows
 
 
-def _time_scans(rig: SimulatedRig, counts: tuple[int, ...] = SCANS, steps: int = STEPS) -> list[Row]:
-    """Rows of registering scans of an object on a turntable that makes ``steps`` or more, with made-up noise."""
+def _time_scans(rig: SimulatedRig, counts: tuple[int, ...] = SCANS) -> list[Row]:
+    """Rows of registering scans of an object on a turntable that makes `STEPS` or more, with made-up noise."""
     rng, clouds = np.random.default_rng(0), {}
-    steps = max(steps, *counts)
+    steps = max(STEPS, *counts)
     for name, scene in turning(steps).items():
         points = Renderer(rig, scene).truth().points
-        noisy = points + rng.normal(0, NOISE_MM, points.shape[:2])[..., None] * np.array([0.0, 0.0, 1.0])
-        clouds[name] = Cloud(noisy, "x", "splined", np.full(points.shape[:2], NOISE_MM))
+        points[..., 2] += rng.normal(0, NOISE_MM, points.shape[:2])
+        clouds[name] = Cloud(points, "x", "splined", np.full(points.shape[:2], NOISE_MM))
     names = list(clouds)
 
     def register(count: float) -> Callable[[], object]:
@@ -178,12 +177,7 @@ def _time_poses(rig: SimulatedRig, plan: dict[str, Any]) -> list[Row]:
         """Return the calibration from the first so many poses."""
         chosen = observations[: int(count)]
 
-        def fit() -> object:
-            """Fit stereo, then splined."""
-            stereo = calibrate_stereo(chosen, rig.projector.size, TARGET)
-            return calibrate_splined(chosen, stereo)
-
-        return fit
+        return lambda: calibrate_splined(chosen, calibrate_stereo(chosen, rig.projector.size, TARGET))
 
     return _measure_growth("calibrate poses, stereo and splined", POSES, calibrate)
 
@@ -205,13 +199,8 @@ def _time_whole_captures(scene: Any) -> list[Row]:
         with tempfile.TemporaryDirectory(prefix="slviewer-bench-") as folder:
             _save_scans(Path(folder, "session"), scale, scene, 1)
             for _ in range(2):  # the first compiles
-                ran = subprocess.run(
-                    [sys.executable, "-c", _RECONSTRUCTED, str(Path(folder, "session"))],
-                    check=True,
-                    capture_output=True,
-                    text=True,
-                )
-        lasted, peak = map(float, ran.stdout.split()[-2:])
+                output = run_python("-c", _RECONSTRUCTED, str(Path(folder, "session")))
+        lasted, peak = map(float, output.split()[-2:])
         seconds.append(lasted)
         memory = peak / (1e6 if sys.platform == "darwin" else 1e3)
         rows.append(row(f"reconstruct a capture, MP: {megapixels:g}", lasted, memory))
@@ -222,8 +211,8 @@ def _time_whole_captures(scene: Any) -> list[Row]:
 
 def _save_scans(session: Path, scale: float, scene: Any, count: int) -> None:
     """Make a session with the rig's true calibration and so many equal scans."""
-    true_calibration(session, letter(scale))
     rig = letter(scale)
+    true_calibration(session, rig)
     sequence = one_axis(p18(rig.projector.size), "x")
     frames = Renderer(rig, scene).capture(sequence)
     with Session.open(session, write=True) as store:

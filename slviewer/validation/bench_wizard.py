@@ -2,7 +2,6 @@
 
 import os
 import statistics
-import subprocess
 import sys
 import tempfile
 import threading
@@ -18,10 +17,10 @@ from typing import Any
 from slviewer.pipeline.feedback import Progress, ignore_progress
 from slviewer.pipeline.reconstruct import reconstruct
 from slviewer.records.verification import Verification
-from slviewer.validation.bench_rows import median, row
+from slviewer.validation.bench_rows import Row, median, row, run_python
 from slviewer.wizard.autopilot import RIG, Autopilot
 from slviewer.wizard.operator import Operator
-from slviewer.wizard.snapshot import Snapshot
+from slviewer.wizard.snapshot import SessionView, Snapshot
 
 POSES = 8
 LIMITS = {
@@ -72,29 +71,31 @@ class _Stopwatch:
         if planned and self._pose is not None and len(snapshot.session.poses) >= 3:
             self.seconds["suggestion of the next pose, from the third on"].append(now - self._pose)
             self._pose = None
-        clouds = [sum(scan.cloud == "fresh" for scan in each.session.scans) for each in (before, snapshot)]  # type: ignore[union-attr]
-        if self._last_frame is not None:
-            if len(snapshot.session.list_records(Verification)) > len(before.session.list_records(Verification)):
-                self.seconds["verify a plane or a sphere with all models"].append(now - self._last_frame)
-            elif clouds[1] > clouds[0] and any(scan.purpose == "scan" for scan in snapshot.session.scans):
-                self.seconds["last frame of a scan to its cloud"].append(now - self._last_frame)
+        if self._last_frame is not None and (stage := _get_new_result(before.session, snapshot.session)):
+            self.seconds[stage].append(now - self._last_frame)
 
     def time_after_installation(self, folder: Path, scale: float) -> None:
         """Time the Autopilot and ``reproduce`` with folders for compiled kernels that are empty."""
         code = f"from {__name__} import run_autopilot as run; run({str(folder / 'first')!r}, {scale})"
         environment = {"NUMBA_CACHE_DIR": str(folder / "autopilot"), _STARTED: str(time.time())}
-        ran = subprocess.run(
-            [sys.executable, "-c", code], check=True, capture_output=True, text=True, env={**os.environ, **environment}
-        )
-        first, whole = map(float, ran.stdout.split()[-2:])
+        first, whole = map(float, run_python("-c", code, **environment).split()[-2:])
         self.seconds["first judged pose after installation"].append(first)
         self.seconds["Autopilot after installation"].append(whole)
         for name in ("after installation", "again"):
             begun = time.perf_counter()
-            _run_command(
-                "reproduce", "--quick", "--out", str(folder / name), NUMBA_CACHE_DIR=str(folder / "reproduction")
-            )
+            command = "reproduce", "--quick", "--out", str(folder / name)
+            run_python("-m", "slviewer.cli", *command, NUMBA_CACHE_DIR=str(folder / "reproduction"))
             self.seconds[f"`slviewer reproduce --quick` {name}"].append(time.perf_counter() - begun)
+
+
+def _get_new_result(before: SessionView, after: SessionView) -> str:
+    """The stage whose result a session has and did not have before: a verification, or a scan's cloud; else empty."""
+    if len(after.list_records(Verification)) > len(before.list_records(Verification)):
+        return "verify a plane or a sphere with all models"
+    clouds = [sum(scan.cloud == "fresh" for scan in session.scans) for session in (before, after)]
+    if clouds[1] > clouds[0] and any(scan.purpose == "scan" for scan in after.scans):
+        return "last frame of a scan to its cloud"
+    return ""
 
 
 def _is_counted(module: str) -> bool:
@@ -138,7 +139,7 @@ _WAITING = ("threading.py", "selectors.py", "socket.py", "queue.py", "subprocess
 """Files of the standard library in which a thread waits."""
 
 
-def time_wizard(scale: float = 0.5, progress: Progress = ignore_progress) -> list[dict[str, Any]]:
+def time_wizard(scale: float = 0.5, progress: Progress = ignore_progress) -> list[Row]:
     """Rows of what an operator waits for, with the seconds of the slowest acts of the Autopilot and of the functions
     that the slowest one spent them in.
 
@@ -174,7 +175,7 @@ def time_wizard(scale: float = 0.5, progress: Progress = ignore_progress) -> lis
             (f"`slviewer validate` on {POSES} poses", 1, "validate", str(session)),
             ("`slviewer --help`", 5, "--help"),
         ):
-            watch.seconds[name].append(median(partial(_run_command, *arguments), times, times > 1))
+            watch.seconds[name].append(median(partial(run_python, "-m", "slviewer.cli", *arguments), times, times > 1))
         progress(0.5, "after installation")
         watch.time_after_installation(Path(folder), scale)
     progress(1.0, "measured")
@@ -182,7 +183,7 @@ def time_wizard(scale: float = 0.5, progress: Progress = ignore_progress) -> lis
     for stage, limit in LIMITS.items():
         measured = watch.seconds[stage] or [float("nan")]
         note = f"median of {len(measured)}, the longest {1e3 * max(measured):.0f} ms" if len(measured) > 1 else ""
-        rows.append(row(stage, statistics.median(measured), most_s=limit, note=note))
+        rows.append(row(stage, statistics.median(measured), target=limit, note=note))
         if max(measured) > limit:  # of every time, not of their median
             rows[-1]["holds"] = "no"
     slowest = sorted(lasted, key=lambda each: -each[1])[:_FUNCTIONS]
@@ -192,16 +193,6 @@ def time_wizard(scale: float = 0.5, progress: Progress = ignore_progress) -> lis
         row(f"  {name.removeprefix('slviewer.')}", slowest[0][1] * count / inside.total(), note=f"in {slowest[0][0]}")
         for name, count in inside.most_common(_FUNCTIONS)
     ]
-
-
-def _run_command(*arguments: str, **environment: str) -> None:
-    """Run a command of the program in a process of its own; raises CalledProcessError where it fails."""
-    subprocess.run(
-        [sys.executable, "-m", "slviewer.cli", *arguments],
-        check=True,
-        capture_output=True,
-        env={**os.environ, **environment},
-    )
 
 
 def run_autopilot(session: str, scale: float) -> None:

@@ -5,7 +5,7 @@ Target poses are rendered once, and disturbed afterwards where a fault allows it
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -95,11 +95,12 @@ class FaultBench:
 
     def examine_clean(self, count: int | None = None) -> list[Judged]:
         """Read all captures, or the first ``count``, without a fault; cached."""
-        for i in range(self.count if count is None else count):
+        wanted = range(self.count if count is None else count)
+        for i in wanted:
             if i not in self._examined:
                 frames = self._frames.get(i)
                 self._examined[i] = self.examine(i, self.render(self.poses[i], i) if frames is None else frames)
-        return [self._examined[i] for i in range(self.count if count is None else count)]
+        return [self._examined[i] for i in wanted]
 
     def attempt(self, captures: Sequence[Judged], board: Board | None = None) -> DiagnosedCalibration:
         """Calibrate from examined captures."""
@@ -207,10 +208,10 @@ FAULTS: Mapping[str, tuple[Cause, Callable[[FaultBench], DiagnosedCalibration]]]
     "x and y frames exchanged": ("axes-swapped", lambda bench: bench.attempt_disturbed(_exchange_halves)),
     "columns from right to left": ("axis-reversed", lambda bench: bench.attempt_disturbed(reverse="x")),
     "rows from bottom to top": ("axis-reversed", lambda bench: bench.attempt_disturbed(reverse="y")),
-    "period 18 described as 16": ("fringe-period", lambda bench: _describe_periods(bench, x=16.0, y=16.0)),
-    "period 18 described as 20": ("fringe-period", lambda bench: _describe_periods(bench, x=20.0, y=20.0)),
-    "period 18 described as 36": ("fringe-period", lambda bench: _describe_periods(bench, x=36.0, y=36.0)),
-    "period 18 described as 16 along x": ("fringe-period", lambda bench: _describe_periods(bench, x=16.0)),
+    "period 18 described as 16": ("fringe-period", partial(_describe_periods, x=16.0, y=16.0)),
+    "period 18 described as 20": ("fringe-period", partial(_describe_periods, x=20.0, y=20.0)),
+    "period 18 described as 36": ("fringe-period", partial(_describe_periods, x=36.0, y=36.0)),
+    "period 18 described as 16 along x": ("fringe-period", partial(_describe_periods, x=16.0)),
     "board of 20x16 given": ("board-size", lambda bench: _describe_board(bench, 20, 16)),
     "board of 21x15 given": ("board-size", lambda bench: _describe_board(bench, 21, 15)),
     "board of 22x16 given": ("board-size", lambda bench: _describe_board(bench, 22, 16)),

@@ -159,10 +159,10 @@ class HostileBench:
                 verify.run(store, settings, warn=job.warn)
             except SlviewerError as error:
                 report.warnings.append(str(error))
-        return compare_with_truth(done.cloud, *truth)
+        return match_with_truth(done.cloud, *truth)
 
 
-def compare_with_truth(cloud: Cloud, renderer: Renderer, clean: Renderer) -> MeasuredScan:
+def match_with_truth(cloud: Cloud, renderer: Renderer, clean: Renderer) -> MeasuredScan:
     """The cloud's points beside those that a perfect instrument would measure, of the scene as it was."""
     truth = renderer.truth()
     points = truth.points

@@ -1,11 +1,17 @@
 """The result of proving one claim: a table, the figures that must lie within bounds, and all of it as JSON."""
 
-from collections.abc import Mapping, Sequence
+import json
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeVar
+
+import numpy as np
 
 from slviewer.evaluation.render import Row, render
+from slviewer.pipeline.feedback import Progress, part
 from slviewer.records.plain import to_plain
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -46,8 +52,9 @@ class Proof:
 
     def to_json(self) -> dict[str, Any]:
         """Return plain values; NaN becomes None."""
-        plain: dict[str, Any] = to_plain({"scale": self.scale, "holds": self.holds, **self.record})
-        return {key: _without_nan(value) for key, value in plain.items()}
+        text = json.dumps({"scale": self.scale, "holds": self.holds, **self.record}, default=to_plain)
+        plain: dict[str, Any] = json.loads(text, parse_constant={"NaN": None, "Infinity": float("inf")}.get)
+        return plain
 
 
 def prove_checks(
@@ -65,10 +72,16 @@ def prove_checks(
     return Proof(not failed, scale, rows, {"checks": figures, **record}, above, [*below, summary, *failed])
 
 
-def _without_nan(value: Any) -> Any:
-    """A copy of nested dicts and lists with None for NaN."""
-    if isinstance(value, dict):
-        return {key: _without_nan(each) for key, each in value.items()}
-    if isinstance(value, list | tuple):
-        return [_without_nan(each) for each in value]
-    return None if isinstance(value, float) and value != value else value
+def track(
+    progress: Progress, named: Mapping[str, T], start: float = 0.0, end: float = 1.0
+) -> Iterator[tuple[str, T, Progress]]:
+    """Yield each item with its name, which is reported, and the progress of its share of ``start`` to ``end``."""
+    for i, (name, item) in enumerate(named.items()):
+        begin, after = (start + (end - start) * k / len(named) for k in (i, i + 1))
+        progress(begin, name)
+        yield name, item, part(progress, begin, after, name)
+
+
+def root_mean_square(values: np.ndarray) -> float:
+    """Return the root of the mean square; NaN without values."""
+    return float(np.sqrt(np.mean(values**2))) if values.size else float("nan")

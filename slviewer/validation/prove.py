@@ -83,8 +83,9 @@ def prove(
     proofs: dict[Claim, Proof] = {}
     for i, claim in enumerate(chosen):
         report = part(progress, i / len(chosen), (i + 1) / len(chosen))
-        hostile = claim == "hostile"
-        options: dict[str, Any] = {"cases": cases, "splined": not quick} if hostile else {}
-        size = min(scale, HOSTILE_SCALE) if hostile else scale
+        size, options = scale, {}
+        if claim == "hostile":
+            size, options = min(scale, HOSTILE_SCALE), {"cases": cases, "splined": not quick}
         proofs[claim] = CLAIMS[claim][1](size, seed=seed, progress=report, **options)
+        report(1.0, "proven")
     return Proofs(proofs)

@@ -8,6 +8,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
+from statistics import fmean
 from time import perf_counter
 from typing import Literal
 
@@ -32,7 +33,7 @@ from slviewer.simulation.rig import SimulatedRig, letter
 from slviewer.simulation.scenes import Spheres
 from slviewer.simulation.truth import PerfectModel
 from slviewer.target.board import Board
-from slviewer.validation.proof import BandCheck, Proof, prove_checks
+from slviewer.validation.proof import BandCheck, Proof, prove_checks, track
 from slviewer.validation.rendered_calibration import (
     DEFAULT_SETTINGS,
     CalibrationSettings,
@@ -119,7 +120,7 @@ class RigFigures:
     def mean_mm(self, model: str, region: str | None = None) -> float:
         """Mean plane RMS of a model, of one region or of all; NaN where no plane lies there."""
         chosen = [p.rms_mm[model] for p in self.planes.values() if region in (None, p.region)]
-        return float(np.mean(chosen)) if chosen else float("nan")
+        return fmean(chosen) if chosen else math.nan
 
     def over_floor(self, region: str) -> float:
         """Splined's mean plane RMS over the floor in a region; NaN where no plane lies there."""
@@ -140,7 +141,7 @@ class RigFigures:
     def largest_errors_mm(self) -> tuple[float, float]:
         """Splined's largest errors of a radius and of a spacing; NaN where one is not known."""
         errors = self.radius_error_mm["splined"], self.spacing_error_mm["splined"]
-        radius, spacing = (float(np.max(np.abs(list(each.values())))) for each in errors)
+        radius, spacing = (np.max(np.abs(list(each.values()))) for each in errors)
         return radius, spacing
 
 
@@ -158,25 +159,19 @@ def prove_accuracy(
 
     ``shapes``: those of the Letter's planes and spheres that are measured; by default all.
     """
-    chosen = rig_cases(seed) if rigs is None else rigs
-    figures = [
-        measure_rig(
-            case, scale, poses, part(progress, i / len(chosen), (i + 1) / len(chosen), case.name), shapes, settings
-        )
-        for i, case in enumerate(chosen)
-    ]
-    progress(1.0, "proven")
+    cases = {case.name: case for case in (rig_cases(seed) if rigs is None else rigs)}
+    figures = [measure_rig(case, scale, poses, report, shapes, settings) for _, case, report in track(progress, cases)]
     return judge_accuracy(figures, scale)
 
 
 def judge_accuracy(rigs: Sequence[RigFigures], scale: float) -> Proof:
     """The proof from the figures of all rigs."""
     title = f"mean plane RMS in mm over pixels seen in {COVERED} poses or more, at scale {scale:g}"
-    checks = [check for rig in rigs for check in check_rig(rig)]
+    checks = [check for rig in rigs for check in check_figures(rig)]
     return prove_checks(checks, scale, [_make_row(rig) for rig in rigs], {"rigs": rigs}, [title])
 
 
-def check_rig(rig: RigFigures) -> tuple[BandCheck, ...]:
+def check_figures(rig: RigFigures) -> tuple[BandCheck, ...]:
     """The checks of one rig's figures against their bounds."""
     floor, splined = rig.mean_mm(FLOOR), rig.mean_mm("splined")
     regions = {plane.region for plane in rig.planes.values()}
@@ -210,7 +205,7 @@ def _make_row(rig: RigFigures) -> Row:
         "worst radius": radius,
         "worst spacing": spacing,
         "measured %": 100 * rig.measured,
-        "holds": "yes" if all(check.holds for check in check_rig(rig)) else "NO",
+        "holds": "yes" if all(check.holds for check in check_figures(rig)) else "NO",
         "s": f"{rig.seconds:.0f}",
     }
 
@@ -230,14 +225,15 @@ def measure_rig(
     start = perf_counter()
     rig = case.rig(scale)
     plan = letter_plan(rig, Board.parse(settings.target), poses, case.shape)
-    targets = {name: scene for name, scene in plan.items() if name.startswith("pose_")}
-    measurable = {name: scene for name, scene in plan.items() if name.startswith(("plane_", "sphere_"))}
-    measured_shapes = {name: scene for name, scene in measurable.items() if not shapes or name in shapes}
-    stereo, splined, observations = calibrate_rendered(rig, targets, part(progress, 0.0, 0.6), settings)
-    pixelwise = calibrate_pixelwise(observations, stereo)
+    measured_shapes = {
+        name: scene
+        for name, scene in plan.items()
+        if name.startswith(("plane_", "sphere_")) and (not shapes or name in shapes)
+    }
+    stereo, splined, observations = calibrate_rendered(rig, plan, part(progress, 0.0, 0.6), settings)
     models: dict[str, Model] = {
         "stereo": stereo,
-        "pixelwise": pixelwise,
+        "pixelwise": calibrate_pixelwise(observations, stereo),
         "splined": splined,
         FLOOR: PerfectModel(rig),
     }
@@ -245,10 +241,9 @@ def measure_rig(
     planes: dict[str, PlaneFigures] = {}
     spheres: dict[str, Spheres] = {}
     fits: dict[str, dict[str, SphereResult]] = {}
-    for i, (name, scene) in enumerate(measured_shapes.items()):
-        progress(0.6 + 0.4 * i / len(measured_shapes), name)
+    for name, scene, _ in track(progress, measured_shapes, 0.6, 1.0):
         phase = render_phase(Renderer(rig, scene), name, list(plan).index(name), settings)
-        comparison, measured = compare_models(models, phase, covered, isinstance(scene, Spheres))
+        comparison, measured = compare_fits(models, phase, covered, isinstance(scene, Spheres))
         if isinstance(scene, Spheres):
             spheres[name] = scene
             for model, result in comparison.results.items():
@@ -256,10 +251,6 @@ def measure_rig(
                 fits.setdefault(model, {})[name] = result
         else:
             planes[name] = _make_plane_figures(comparison, measured)
-    spacings = {
-        f"{a} - {b}": (a, b, float(np.linalg.norm(spheres[a].centres[0] - spheres[b].centres[0])))
-        for a, b in combinations(spheres, 2)
-    }
     return RigFigures(
         case.name,
         case.seed,
@@ -268,9 +259,9 @@ def measure_rig(
         {m: {n: fit.radius_mm - spheres[n].radius_mm for n, fit in each.items()} for m, each in fits.items()},
         {
             model: {
-                pair: float(np.linalg.norm(each[a].sphere.centre - each[b].sphere.centre)) - true
-                for pair, (a, b, true) in spacings.items()
-                if a in each and b in each
+                f"{a} - {b}": math.dist(each[a].sphere.centre, each[b].sphere.centre)
+                - math.dist(spheres[a].centres[0], spheres[b].centres[0])
+                for a, b in combinations(each, 2)
             }
             for model, each in fits.items()
         },
@@ -288,7 +279,7 @@ def covered_pixels(observations: Sequence[Observation]) -> np.ndarray:
     return np.asarray(poses >= COVERED)
 
 
-def compare_models(
+def compare_fits(
     models: Mapping[str, Model], phase: PhaseMap, covered: np.ndarray, is_sphere: bool
 ) -> tuple[Comparison, float]:
     """Every model's fit to one capture over the covered pixels, and the share of these that splined measures."""
@@ -315,8 +306,8 @@ def compare_models(
             )
         except InputError:
             continue  # it measures nothing there
-    to_score = int(np.count_nonzero(comparison.region & clouds["stereo"].mask & clouds[FLOOR].mask))
-    return comparison, int(np.count_nonzero(comparison.common)) / max(to_score, 1)
+    to_score = comparison.region & clouds["stereo"].mask & clouds[FLOOR].mask
+    return comparison, float(comparison.common.sum() / max(to_score.sum(), 1))
 
 
 def _make_plane_figures(comparison: Comparison, measured: float) -> PlaneFigures:

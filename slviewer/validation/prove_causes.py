@@ -1,6 +1,8 @@
 """Whether every fault of a calibration is named as its cause, and sound calibrations raise no alarm."""
 
+from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
+from functools import partial
 from time import perf_counter
 
 from slviewer.calibration.diagnosis.diagnose import DiagnosedCalibration
@@ -11,7 +13,7 @@ from slviewer.simulation.boards import BoardShape
 from slviewer.simulation.rig import letter
 from slviewer.target.board import Board
 from slviewer.validation.faulty_captures import BOARD, FAULTS, POSES, FaultBench
-from slviewer.validation.proof import Proof
+from slviewer.validation.proof import Proof, track
 
 BOARDS = (BOARD, Board.parse("circles:14x11:13"), Board.parse("circles:17x13:11"), Board.parse("chessboard:10x7:18"))
 """That calibrations without a fault are made from in turn."""
@@ -33,32 +35,24 @@ def prove_causes(
     ``steps``. A fault passes where the first finding is its cause, a clean calibration where there is none.
     """
     bench = FaultBench(letter(scale, seed), count=poses, steps=steps)
-    cases: list[tuple[str, Cause | None, Callable[[], DiagnosedCalibration]]] = [
-        (name, FAULTS[name][0], lambda name=name: FAULTS[name][1](bench))  # type: ignore[misc]
-        for name in faults
-    ]
+    cases: dict[str, tuple[Cause | None, Callable[[], DiagnosedCalibration]]] = {
+        name: (FAULTS[name][0], partial(FAULTS[name][1], bench)) for name in faults
+    }
     for k in range(clean):
         board, count, rig_seed = BOARDS[k % len(BOARDS)], poses + k % 5, seed + 1 + k
-        shape = BoardShape(misplaced_mm=0.01 * (k % 3))
-        cases.append((
-            f"clean, seed {rig_seed}, {board}, {count} poses",
-            None,
-            lambda board=board, count=count, rig_seed=rig_seed, shape=shape: _attempt_clean(  # type: ignore[misc]
-                FaultBench(letter(scale, rig_seed), board, count, shape, steps)
-            ),
-        ))  # fmt: skip
+        sound = FaultBench(letter(scale, rig_seed), board, count, BoardShape(misplaced_mm=0.01 * (k % 3)), steps)
+        cases[f"clean, seed {rig_seed}, {board}, {count} poses"] = None, partial(_attempt_clean, sound)
     rows: list[Row] = []
     record = []
-    confusion: dict[str, dict[str, int]] = {}
-    for name, cause, attempt in cases:
-        progress(len(rows) / len(cases), name)
+    confusion: dict[str, Counter[str]] = defaultdict(Counter)
+    for name, (cause, attempt), _ in track(progress, cases):
         start = perf_counter()
         verdict = attempt().verdict
         first = next(iter(verdict.causes), "none")
-        counts = confusion.setdefault(cause or "none", {})
-        counts[first] = counts.get(first, 0) + 1
-        row = {"fault": name, "cause": cause or "none"}
-        rows.append(row | {
+        confusion[cause or "none"][first] += 1
+        rows.append({
+            "fault": name,
+            "cause": cause or "none",
             "named": ", ".join(verdict.causes) or "none",
             "verdict": verdict.level,
             "right": "yes" if first == (cause or "none") else "NO",
@@ -68,7 +62,6 @@ def prove_causes(
             "fault": name, "cause": cause, "causes": list(verdict.causes), "level": verdict.level,
             "reason": verdict.reason, "findings": [finding.sentence for finding in verdict.findings],
         })  # fmt: skip
-    progress(1.0, "proven")
     right = sum(row["right"] == "yes" for row in rows)
     line = f"{right} of {len(rows)} named rightly, at scale {scale:g}"
     return Proof(right == len(rows), scale, rows, {"confusion": confusion, "cases": record}, below=[line])

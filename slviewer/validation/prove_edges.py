@@ -7,7 +7,7 @@ import numpy as np
 
 from slviewer.evaluation.render import Row
 from slviewer.fringe.phase import PhaseMap
-from slviewer.pipeline.feedback import Progress, ignore_progress
+from slviewer.pipeline.feedback import Progress
 from slviewer.reconstruction.reconstruct import normals, reconstruct_cloud
 from slviewer.simulation.boards import BoardScene, Pose, printed_board
 from slviewer.simulation.mesh import demo_object
@@ -16,7 +16,7 @@ from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import SimulatedRig, letter
 from slviewer.simulation.truth import PerfectModel
 from slviewer.target.board import Board
-from slviewer.validation.proof import BandCheck, Proof, prove_checks
+from slviewer.validation.proof import BandCheck, Proof, prove_checks, root_mean_square, track
 from slviewer.validation.rendered_calibration import render_phase
 
 PRINT = "chessboard:7x5:32"
@@ -33,33 +33,28 @@ _BINS_PX = 0.5
 _NEAR_PX = 3
 
 
-def prove_edges(scale: float = 1.0, *, seed: int = 0, progress: Progress = ignore_progress) -> Proof:
+def prove_edges(scale: float, seed: int, progress: Progress) -> Proof:
     """Measure the ridges of a printed plane and the edges of the demo object, with and without the correction."""
     rows: list[Row] = []
     checks: list[BandCheck] = []
-    blurs = [blur for blur in BLURS_PX if blur <= MAX_BLUR_SHARE * scale]
-    for i, blur in enumerate(blurs):
-        progress(i / len(blurs), f"blur {blur:g} px")
+    blurs = {f"blur {blur:g} px": blur for blur in BLURS_PX if blur <= MAX_BLUR_SHARE * scale}
+    for name, blur, _ in track(progress, blurs):
         rig = letter(scale, seed)
         rig = replace(rig, sensor=replace(rig.sensor, psf_px=blur / scale))
-        before, after = (1e3 * ridge for ridge in measure_ridges(rig, seed))
-        name = f"blur {blur:g} px"
-        rows.append(_row(f"printed plane, {name}", before, after))
-        checks.append(BandCheck(name, "ridge's factor", before / after, LOWER, 100.0))
-        before, after = (1e3 * rms for rms in measure_object_edges(rig, seed))
-        rows.append(_row(f"object's edges, {name}", before, after))
-        checks.append(BandCheck(name, "factor at an object's edges", before / after, 0.98, 100.0))
+        for scene, measure, what, least in (
+            ("printed plane", measure_ridges, "ridge's factor", LOWER),
+            ("object's edges", measure_object_edges, "factor at an object's edges", 0.98),
+        ):
+            before, after = (1e3 * error for error in measure(rig, seed))
+            ratio = before / after
+            rows.append({"scene": f"{scene}, {name}", "without, µm": before, "with, µm": after, "ratio": ratio})
+            checks.append(BandCheck(name, what, ratio, least, 100.0))
     above = [
         "Peak to valley of the mean depth error across the edges of a print, and RMS depth error within "
         f"{_NEAR_PX} px of an object's creases and depth jumps, by the true lenses.",
         "",
     ]
     return prove_checks(checks, scale, rows, {"rows": rows}, above=above)
-
-
-def _row(scene: str, before: float, after: float) -> Row:
-    """A table row of an error without and with the correction."""
-    return {"scene": scene, "without, µm": before, "with, µm": after, "ratio": before / after}
 
 
 def measure_ridges(rig: SimulatedRig, seed: int = 0) -> tuple[float, float]:
@@ -83,7 +78,8 @@ def measure_object_edges(rig: SimulatedRig, seed: int = 0) -> tuple[float, float
     truth = renderer.truth().points
     before, after = _measure_depth_errors(rig, render_phase(renderer, "object", seed), truth[..., 2])
     near = _find_creases(truth) & np.isfinite(before) & np.isfinite(after)
-    return tuple(float(np.sqrt(np.mean(np.minimum(np.abs(each[near]), 1.0) ** 2))) for each in (before, after))  # type: ignore[return-value]
+    rms_before, rms_after = (root_mean_square(np.clip(each[near], -1.0, 1.0)) for each in (before, after))
+    return rms_before, rms_after
 
 
 def _measure_depth_errors(rig: SimulatedRig, phase: PhaseMap, true_z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -99,18 +95,15 @@ def _signed_distance(rig: SimulatedRig, scene: BoardScene) -> tuple[np.ndarray, 
     albedo = scene.trace(rig.camera.rays()).albedo
     over = albedo - (scene.white + scene.dark) / 2
     distance, side = np.full((height, width), np.nan), np.zeros((height, width), bool)
-    on_plate = albedo > 0
-    for v in range(height):
-        crossings = np.flatnonzero((over[v, :-1] < 0) != (over[v, 1:] < 0))
-        places = crossings + over[v, crossings] / (over[v, crossings] - over[v, crossings + 1])
-        for i, place in enumerate(places):
+    for v, row in enumerate(over):
+        crossings = np.flatnonzero((row[:-1] < 0) != (row[1:] < 0))
+        places = crossings + row[crossings] / (row[crossings] - row[crossings + 1])
+        gaps = np.diff(places, prepend=-np.inf, append=np.inf) > 2 * _REACH_PX
+        for crossing, place, is_isolated in zip(crossings, places, gaps[:-1] & gaps[1:], strict=True):
             first, last = int(place) - _REACH_PX, int(place) + _REACH_PX + 2
-            lonely = (i == 0 or place - places[i - 1] > 2 * _REACH_PX) and (
-                i == len(places) - 1 or places[i + 1] - place > 2 * _REACH_PX
-            )
-            if lonely and first >= 0 and last <= width and on_plate[v, first:last].all():
+            if is_isolated and first >= 0 and last <= width and (albedo[v, first:last] > 0).all():
                 distance[v, first:last] = np.arange(first, last) - place
-                side[v, first:last] = over[v, crossings[i] + 1] > 0
+                side[v, first:last] = row[crossing + 1] > 0
     return distance, side
 
 
@@ -133,8 +126,6 @@ def _find_creases(points: np.ndarray) -> np.ndarray:
     import cv2
 
     normal = np.nan_to_num(normals(points.astype(np.float32), 1))
-    turn = np.zeros(points.shape[:2], np.uint8)
-    for axis in (0, 1):
-        cosine = np.sum(normal * np.roll(normal, 2, axis=axis), axis=2)
-        turn |= (cosine < 0.9).astype(np.uint8)
+    cosines = [np.sum(normal * np.roll(normal, 2, axis=axis), axis=2) for axis in (0, 1)]
+    turn = (np.minimum(*cosines) < 0.9).astype(np.uint8)
     return cv2.dilate(turn, np.ones((2 * _NEAR_PX + 1,) * 2, np.uint8)).astype(bool)

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from statistics import fmean
 from time import perf_counter
 
 import cv2
@@ -11,8 +12,9 @@ from slviewer.calibration.observe import Observation
 from slviewer.calibration.splined.model import SplinedModel
 from slviewer.errors import InputError
 from slviewer.fringe.phase import PhaseMap
+from slviewer.geometry.rigid import move_points, transform_from_rvec
 from slviewer.geometry.shapes import fit_plane
-from slviewer.pipeline.feedback import Progress, ignore_progress, part
+from slviewer.pipeline.feedback import Progress, part
 from slviewer.pipeline.simulate import TARGET
 from slviewer.simulation.boards import Pose, printed_board
 from slviewer.simulation.plans import planes, rotation, target_poses
@@ -20,7 +22,7 @@ from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import SimulatedRig, letter
 from slviewer.simulation.truth import PerfectModel
 from slviewer.target.board import Board
-from slviewer.validation.proof import Proof
+from slviewer.validation.proof import Proof, root_mean_square, track
 from slviewer.validation.rendered_calibration import calibrate_observed, observe_rendered, render_phase
 from slviewer.wizard.pose_plan import PlanInput, PoseFeatures, plan
 
@@ -50,40 +52,27 @@ class WayFigures:
     seconds: float
 
 
-def prove_guidance(
-    scale: float = 1.0,
-    *,
-    rigs: int = RIGS,
-    poses: int = POSES,
-    seed: int = 0,
-    progress: Progress = ignore_progress,
-) -> Proof:
-    """Calibrate each of ``rigs`` simulated rigs from ``poses`` guided poses, and from as many drawn at random as the
+def prove_guidance(scale: float, seed: int, progress: Progress) -> Proof:
+    """Calibrate each of ``RIGS`` simulated rigs from ``POSES`` guided poses, and from as many drawn at random as the
     Letter's were; measure the Letter's ten planes with both.
     """
     figures: list[WayFigures] = []
-    total = rigs * len(_WAYS)
-    for k in range(rigs):
-        rig = letter(scale, seed + k)
-        targets = [_render_plane(rig, name, 100 + i) for i, name in enumerate(planes())]
-        for way in _WAYS:
-            label = f"rig {k + 1} of {rigs}, {way}"
-            report = part(progress, len(figures) / total, (len(figures) + 1) / total, label)
-            start, predicted = perf_counter(), None
-            if way == "guided":
-                observations, predicted = _observe_guided(rig, poses, report)
-            else:
-                observations = _observe_random(rig, poses, report)
-            report(0.9, "calibrating")
-            model = calibrate_observed(rig, observations)[1]
-            rms, floor, supported, unmeasured = zip(*(_measure_plane(model, t) for t in targets), strict=True)
-            over_floor = float(np.mean(rms) / np.mean(floor))
-            seconds = perf_counter() - start
-            figures.append(
-                WayFigures(way, rig.seed, len(observations), rms, floor, supported, sum(unmeasured), predicted,
-                           over_floor, seconds)
-            )  # fmt: skip
-    progress(1.0, "proven")
+    ways = {f"rig {k + 1} of {RIGS}, {way}": (seed + k, way) for k in range(RIGS) for way in _WAYS}
+    for _, (rig_seed, way), report in track(progress, ways):
+        if way == _WAYS[0]:
+            rig = letter(scale, rig_seed)
+            targets = [_render_plane(rig, name, 100 + i) for i, name in enumerate(planes())]
+        start = perf_counter()
+        observations, predicted = (_observe_guided if way == "guided" else _observe_random)(rig, POSES, report)
+        report(0.9, "calibrating")
+        model = calibrate_observed(rig, observations)[1]
+        rms, floor, supported, unmeasured = zip(*(_measure_plane(model, t) for t in targets), strict=True)
+        over_floor = fmean(rms) / fmean(floor)
+        seconds = perf_counter() - start
+        figures.append(
+            WayFigures(way, rig_seed, len(observations), rms, floor, supported, sum(unmeasured), predicted,
+                       over_floor, seconds)
+        )  # fmt: skip
     return judge_guidance(figures, scale)
 
 
@@ -93,39 +82,37 @@ def judge_guidance(figures: Sequence[WayFigures], scale: float) -> Proof:
         {
             "poses": f"{each.poses} {each.way}",
             "seed": each.seed,
-            "RMS mm": float(np.mean(each.rms_mm)),
-            "floor mm": float(np.mean(each.floor_mm)),
+            "RMS mm": fmean(each.rms_mm),
+            "floor mm": fmean(each.floor_mm),
             "over floor": each.over_floor,
             "worst plane": float(np.max(np.divide(each.rms_mm, each.floor_mm))),
-            "supported %": 100 * float(np.mean(each.supported)),
+            "supported %": 100 * fmean(each.supported),
             "not measured": each.unmeasured,
             "s": round(each.seconds, 1),
         }
         for each in figures
     ]
     means = {
-        way: (
-            float(np.mean([each.over_floor for each in figures if each.way == way])),
-            float(np.mean([np.mean(each.supported) for each in figures if each.way == way])),
-        )
+        way: np.mean([(each.over_floor, fmean(each.supported)) for each in figures if each.way == way], axis=0)
         for way in _WAYS
     }
     lines = [
         f"{way}: {over:.2f} times the floor, {100 * share:.0f} % supported" for way, (over, share) in means.items()
     ]
-    holds = means["guided"][0] <= MOST_OVER_FLOOR and means["guided"][1] >= LEAST_SUPPORTED
+    over, share = means["guided"]
+    holds = bool(over <= MOST_OVER_FLOOR and share >= LEAST_SUPPORTED)
     wanted = f"wanted of guided poses: at most {MOST_OVER_FLOOR:g} times, at least {100 * LEAST_SUPPORTED:g} %"
     lines.append(f"{wanted}: {'reached' if holds else 'NOT reached'}")
     return Proof(holds, scale, rows, {"outcomes": figures}, below=lines)
 
 
-def _observe_random(rig: SimulatedRig, count: int, report: Progress) -> list[Observation]:
+def _observe_random(rig: SimulatedRig, count: int, report: Progress) -> tuple[list[Observation], None]:
     """The observations of poses drawn at random like the Letter's; undetected ones are skipped."""
     observations = [
         _observe_pose(rig, pose, i, part(report, 0.9 * i / count, 0.9))
         for i, pose in enumerate(target_poses(rig, BOARD, count))
     ]
-    return [each for each in observations if each is not None]
+    return [each for each in observations if each is not None], None
 
 
 def _observe_guided(rig: SimulatedRig, count: int, report: Progress) -> tuple[list[Observation], float | None]:
@@ -169,15 +156,13 @@ def _solve_suggested_pose(rig: SimulatedRig, outline_px: np.ndarray) -> np.ndarr
     follows, whatever the program believes of the lens."""
     rays = rig.camera.undistort(outline_px)
     _, turn, t = cv2.solvePnP(BOARD.outline(), rays, np.eye(3), np.zeros(5), flags=cv2.SOLVEPNP_IPPE)
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = cv2.Rodrigues(turn)[0], t.ravel()
-    return T
+    return transform_from_rvec(turn, t)
 
 
 def _vary_pose(rig: SimulatedRig, T_camera_board: np.ndarray, rng: np.random.Generator) -> Pose:
     """Sample a pose near the given one with every feature in view, as a hand moves the board until it is detected."""
     middle = (BOARD.points.min(0) + BOARD.points.max(0)) / 2
-    centre = T_camera_board[:3, :3] @ middle + T_camera_board[:3, 3]
+    centre = move_points(T_camera_board, middle[None])[0]
     for k in range(_TRIES):
         steady = 1 - k / _TRIES
         R = rotation(np.radians(steady * rng.normal(0, HAND_DEG, 3))) @ T_camera_board[:3, :3]
@@ -217,12 +202,12 @@ def _measure_plane(model: SplinedModel, target: _TargetPlane) -> tuple[float, fl
     return (
         _compute_plane_rms(points[known]),
         _compute_plane_rms(target.exact[known]),
-        float(np.count_nonzero(supported) / np.count_nonzero(target.illuminated)),
-        int(np.count_nonzero(target.illuminated & ~known)),
+        float(supported.sum() / target.illuminated.sum()),
+        int((target.illuminated & ~known).sum()),
     )
 
 
 def _compute_plane_rms(points: np.ndarray) -> float:
     """Plane RMS in mm over all points (n, 3), outliers included."""
-    plane = fit_plane(points.astype(float))
-    return float(np.sqrt(np.mean(plane.distance(points.astype(float)) ** 2)))
+    points = points.astype(float)
+    return root_mean_square(fit_plane(points).distance(points))

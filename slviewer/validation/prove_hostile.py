@@ -18,12 +18,12 @@ import numpy as np
 
 from slviewer.errors import SlviewerError, UsageError
 from slviewer.evaluation.render import Row
-from slviewer.geometry.rigid import fit_rigid
+from slviewer.geometry.rigid import fit_rigid, move_points
 from slviewer.pipeline.feedback import Progress, ignore_progress
 from slviewer.simulation.hostile import FAULTS, SEVERITIES, Direction, Fault, Severity
 from slviewer.simulation.rig import letter
 from slviewer.validation.hostile_captures import SCANS, CaseReport, HostileBench, MeasuredScan
-from slviewer.validation.proof import Proof
+from slviewer.validation.proof import Proof, root_mean_square
 
 MOST_OVER_FLOOR = 1.5
 """Times the undisturbed RMS, within which a case is measured."""
@@ -93,17 +93,16 @@ class HostileCase:
 
     def row(self) -> Row:
         """The case as a row of the table."""
-        nan = float("nan")
-        figures = self.figures or Figures(nan, nan, nan, nan)
+        figures = self.figures or Figures(*[float("nan")] * 4)
         return {
             "fault": self.fault,
             "severity": self.severity,
             "in": self.direction,
-            "RMS mm": round(figures.rms_mm, 3),
-            "predicted": round(figures.predicted_mm, 3),
-            "floor": round(self.floor.rms_mm, 3),
-            ">3 sigma %": round(100 * figures.gross, 1),
-            "coverage %": round(100 * figures.coverage, 1),
+            "RMS mm": figures.rms_mm,
+            "predicted": figures.predicted_mm,
+            "floor": self.floor.rms_mm,
+            ">3 sigma %": 100 * figures.gross,
+            "coverage %": 100 * figures.coverage,
             "named": ", ".join(self.named) or "-",
             "outcome": self.outcome,
             "s": round(self.seconds, 1),
@@ -133,7 +132,6 @@ def prove_hostile(
         for i, (name, severity, direction) in enumerate(chosen):
             progress((i + 1) / (len(chosen) + 1), f"{name}, {severity}, in the {direction}")
             done.append(trial.run(name, severity, direction))
-    progress(1.0, "proven")
     failed = [case for case in done if not case.passed]
     lines = [f"{len(done) - len(failed)} of {len(done)} hold, at scale {scale:g}"]
     for case in failed:
@@ -170,9 +168,9 @@ class _Trial:
         self._bench = bench
         self._session = bench.folder / "sound"
         report = CaseReport()
-        bench.store(self._session, {name: bench.capture(name)[0] for name in bench.scenes}, report)
+        bench.store(self._session, {name: bench.capture(name)[0] for name in bench.targets}, report)
         bench.calibrate(self._session, report)
-        measured = [bench.measure(self._session, name, bench.capture(name)[1:], report) for name in SCANS]
+        measured = self._measure_scans(self._session, report)
         self._gauge = fit_gauge(measured)
         self._floor = score(measured, self._gauge)
 
@@ -181,25 +179,28 @@ class _Trial:
         start, report = perf_counter(), CaseReport()
         measured: Sequence[MeasuredScan] = ()
         try:
-            measured = (self._measure_faulty_scans if direction == "scan" else self._measure_after_faulty_calibration)(
-                FAULTS[name], severity, report
-            )
+            if direction == "scan":
+                measured = self._measure_scans(self._session, report, FAULTS[name], severity)
+            else:
+                measured = self._measure_after_faulty_calibration(FAULTS[name], severity, report)
         except Exception as error:  # the other cases still have to run
             report.error = error
         gauge = self._gauge if direction == "scan" or not measured else fit_gauge(measured)
         figures = score(measured, gauge) if measured else None
-        outcome, named = judge(FAULTS[name], severity, report, figures, self._floor)
+        outcome, named = judge_case(FAULTS[name], severity, report, figures, self._floor)
         messages = [*report.warnings, *([f"{type(report.error).__name__}: {report.error}"] if report.error else [])]
         seconds = perf_counter() - start
         return HostileCase(
             name, severity, direction, outcome, outcome in PASSED, figures, self._floor, named, tuple(messages), seconds
         )
 
-    def _measure_faulty_scans(self, fault: Fault, severity: Severity, report: CaseReport) -> Sequence[MeasuredScan]:
-        """Measure all scans, captured with the fault, with the clean calibration."""
+    def _measure_scans(
+        self, session: Path, report: CaseReport, fault: Fault | None = None, severity: Severity = "mild"
+    ) -> list[MeasuredScan]:
+        """Measure all scans, captured with the fault if there is one, with the calibration of a session."""
         shots = {name: self._bench.capture(name, fault, severity) for name in SCANS}
-        self._bench.store(self._session, {name: shot[0] for name, shot in shots.items()}, report)
-        return [self._bench.measure(self._session, name, shot[1:], report) for name, shot in shots.items()]
+        self._bench.store(session, {name: shot[0] for name, shot in shots.items()}, report)
+        return [self._bench.measure(session, name, shot[1:], report) for name, shot in shots.items()]
 
     def _measure_after_faulty_calibration(
         self, fault: Fault, severity: Severity, report: CaseReport
@@ -211,75 +212,79 @@ class _Trial:
         frames = {n: bench.capture(n, *((fault, severity) if n in struck else ()))[0] for n in bench.targets}
         bench.store(session, frames, report)
         bench.calibrate(session, report)
-        bench.store(session, {name: bench.capture(name)[0] for name in SCANS}, report)
-        return [bench.measure(session, name, bench.capture(name)[1:], report) for name in SCANS]
+        return self._measure_scans(session, report)
 
 
-def judge(
+def judge_case(
     fault: Fault, severity: Severity, report: CaseReport, figures: Figures | None, floor: Figures
 ) -> tuple[Outcome, tuple[str, ...]]:
     """The outcome of a case, and the causes that the program named."""
-    named = list(report.named)
-    texts = [*report.warnings, *([str(report.error)] if report.error and not named else [])]
-    named += [causes for pattern, causes in _WORDS if any(re.search(pattern, text) for text in texts)]
-    maybe = [causes for pattern, causes in _OPEN if any(re.search(pattern, text) for text in texts)]
-    named += [causes for causes in maybe if causes & fault.causes]
+    texts = [*report.warnings, *([str(report.error)] if report.error and not report.named else [])]
+    named = report.named + _match_causes(_WORDS, texts)
+    named += [causes for causes in _match_causes(_OPEN, texts) if causes & fault.causes]
     words = tuple(dict.fromkeys("|".join(sorted(each)) for each in named))
-    right = any(each & fault.causes for each in named)
-    must = fault.must_measure and severity == "mild"
     if report.error is not None and not isinstance(report.error, SlviewerError):
         return "CRASH", words
+    is_right = any(each & fault.causes for each in named)
+    must_measure = fault.must_measure and severity == "mild"
     if figures is None or report.error is not None:
-        return ("WRONG REASON" if not right else "TURNED AWAY" if must else "refused"), words
-    good = figures.rms_mm <= MOST_OVER_FLOOR * floor.rms_mm and figures.gross <= floor.gross + GROSS
-    wrong = figures.rms_mm > SIGMAS * figures.predicted_mm or figures.gross > floor.gross + GROSS
-    if named and not right:
+        return ("WRONG REASON" if not is_right else "TURNED AWAY" if must_measure else "refused"), words
+    if named and not is_right:
         return "WRONG REASON", words
-    if good and figures.coverage >= LEAST_COVERAGE * floor.coverage:
-        return "measured", words
-    if must:
-        return ("SILENTLY WRONG" if wrong and not right else "TURNED AWAY"), words
-    if right:
-        return "degraded, warned", words
-    if wrong:
-        return "SILENTLY WRONG", words
-    return (
-        "noisier as predicted" if figures.coverage >= EXPLAINED_LOSS * floor.coverage else "UNEXPLAINED LOSS"
-    ), words
+    return _judge_figures(figures, floor, is_right, must_measure), words
 
 
-def fit_gauge(measured: Sequence[MeasuredScan]) -> tuple[np.ndarray, np.ndarray]:
-    """R (3, 3) and t (3,) mm that carry the measured points of all scans onto their truth.
+def _match_causes(facts: Sequence[tuple[str, frozenset[str]]], texts: Sequence[str]) -> list[frozenset[str]]:
+    """The causes whose pattern is in one of the texts."""
+    return [causes for pattern, causes in facts if any(re.search(pattern, text) for text in texts)]
+
+
+def _judge_figures(figures: Figures, floor: Figures, is_right: bool, must_measure: bool) -> Outcome:
+    """The outcome of a measured case; ``is_right``: a message names its cause."""
+    has_gross = figures.gross > floor.gross + GROSS
+    is_good = figures.rms_mm <= MOST_OVER_FLOOR * floor.rms_mm and not has_gross
+    is_wrong = figures.rms_mm > SIGMAS * figures.predicted_mm or has_gross
+    if is_good and figures.coverage >= LEAST_COVERAGE * floor.coverage:
+        return "measured"
+    if is_right and not must_measure:
+        return "degraded, warned"
+    if is_wrong and not is_right:
+        return "SILENTLY WRONG"
+    if must_measure:
+        return "TURNED AWAY"
+    return "noisier as predicted" if figures.coverage >= EXPLAINED_LOSS * floor.coverage else "UNEXPLAINED LOSS"
+
+
+def fit_gauge(measured: Sequence[MeasuredScan]) -> np.ndarray:
+    """T_truth_measured (4, 4) mm that carries the measured points of all scans onto their truth.
 
     Least squares over the better nine tenths of the targets' points.
     """
     points = np.concatenate([m.points[m.on_target] for m in measured])
     truth = np.concatenate([m.truth[m.on_target] for m in measured])
-    R, t = np.eye(3), np.zeros(3)
+    T = np.eye(4)
     inliers = np.ones(len(points), bool)
     for _ in range(3):
-        if np.count_nonzero(inliers) < 10:
+        if inliers.sum() < 10:
             break
         T = fit_rigid(points[inliers], truth[inliers])
-        R, t = T[:3, :3], T[:3, 3]
-        off = np.linalg.norm(points @ R.T + t - truth, axis=1)
+        off = np.linalg.norm(move_points(T, points) - truth, axis=1)
         inliers = off <= np.quantile(off, 0.9)
-    return R, t
+    return T
 
 
-def score(measured: Sequence[MeasuredScan], gauge: tuple[np.ndarray, np.ndarray]) -> Figures:
+def score(measured: Sequence[MeasuredScan], gauge: np.ndarray) -> Figures:
     """The figures of scans, errors of z in mm after the motion of ``gauge``."""
-    R, t = gauge
-    errors = np.concatenate([(m.points @ R.T + t - m.truth)[:, 2] for m in measured])
+    errors = np.concatenate([(move_points(gauge, m.points) - m.truth)[:, 2] for m in measured])
     sigma = np.concatenate([m.sigma for m in measured])
     target = np.concatenate([m.on_target for m in measured])
     expected = sum(m.expected for m in measured)
     wrong = ~(np.abs(errors) <= SIGMAS * sigma)  # also where nothing is to be seen
-    most = max(1, int(_TRIMMED * np.count_nonzero(target)))
-    squares, predicted = np.sort(errors[target] ** 2)[:most], np.sort(sigma[target] ** 2)[:most]
+    most = max(1, int(_TRIMMED * target.sum()))
+    rms, predicted = (root_mean_square(np.sort(np.abs(values[target]))[:most]) for values in (errors, sigma))
     return Figures(
-        float(np.sqrt(squares.mean())) if len(squares) else float("nan"),
-        float(np.sqrt(predicted.mean())) if len(predicted) else float("nan"),
+        rms,
+        predicted,
         float(wrong.mean()) if len(wrong) else 0.0,
-        float(np.count_nonzero(target) / max(expected, 1)),
+        float(target.sum() / max(expected, 1)),
     )

@@ -12,8 +12,8 @@ from slviewer.inspection.features import Feature
 from slviewer.inspection.fitting import fit_feature
 from slviewer.inspection.form import form_error, orientation_error, position_error, profile_error
 from slviewer.inspection.quantities import Quantity
-from slviewer.pipeline.feedback import Progress, ignore_progress
-from slviewer.validation.proof import BandCheck, Proof, prove_checks
+from slviewer.pipeline.feedback import Progress
+from slviewer.validation.proof import BandCheck, Proof, prove_checks, track
 
 REPEATS = 200
 NOISE_MM = 0.02
@@ -30,9 +30,7 @@ RADIUS, HALF = 10.0, 15.0
 Case = tuple[float, Quantity]
 
 
-def prove_plan(
-    scale: float = 1.0, *, repeats: int = REPEATS, seed: int = 0, progress: Progress = ignore_progress
-) -> Proof:
+def prove_plan(scale: float, seed: int, progress: Progress) -> Proof:
     """Measure parts of known form repeatedly, with new noise along the surface's normals; compare U with the errors.
 
     ``scale``: as a share of the number of points along each direction, at least 0.7. Real scans have errors of the
@@ -40,15 +38,14 @@ def prove_plan(
     """
     side = int(SIDE * max(scale, 0.7))
     rows, checks = [], []
-    for k, (kind, measure) in enumerate(CASES.items()):
-        progress(k / len(CASES), kind)
-        cases = [measure(side, np.random.default_rng([seed, k, i])) for i in range(repeats)]
+    for k, (kind, measure, _) in enumerate(track(progress, CASES)):
+        cases = [measure(side, np.random.default_rng([seed, k, i])) for i in range(REPEATS)]
         truths, U = np.array([truth for truth, _ in cases]), np.array([q.U or 0.0 for _, q in cases])
         errors = np.array([q.value for _, q in cases]) - truths
         covered = 100 * float(np.mean(np.abs(errors) <= U))
-        chance = 100 * float(np.sqrt(0.95 * 0.05 / repeats))
+        chance = 100 * float(np.sqrt(0.95 * 0.05 / REPEATS))
         least, most = BAND[0] - chance, BAND[1] + chance
-        checks.append(BandCheck(kind, f"% of {repeats} repeats covered by U (k = 2)", covered, least, most))
+        checks.append(BandCheck(kind, f"% of {REPEATS} repeats covered by U (k = 2)", covered, least, most))
         rows.append(
             {
                 "characteristic": kind,
@@ -59,16 +56,15 @@ def prove_plan(
                 "covered %": round(covered, 1),
             }
         )
-    progress(1.0, "proven")
-    record = {"noise_mm": NOISE_MM, "points": side**2, "repeats": repeats, "rows": rows}
+    record = {"noise_mm": NOISE_MM, "points": side**2, "repeats": REPEATS, "rows": rows}
     return prove_checks(checks, scale, rows, record)
 
 
-def draw_form(rng: np.random.Generator, shape: tuple[int, int] = (7, 7)) -> np.ndarray:
-    """Draw the coefficients (k, m) of a form, mm: of degrees `DEGREES` in sum, decaying with the degree."""
-    degree = np.add.outer(np.arange(shape[0]), np.arange(shape[1]))
-    counted = (degree >= DEGREES[0]) & (degree <= DEGREES[-1])
-    return np.where(counted, FORM_MM * DECAY ** (degree - DEGREES[0]) * rng.normal(size=shape), 0.0)
+def draw_form(rng: np.random.Generator) -> np.ndarray:
+    """Draw the coefficients (7, 7) of a form, mm: of degrees `DEGREES` in sum, decaying with the degree."""
+    degree = np.add.outer(np.arange(7), np.arange(7))
+    amplitude = FORM_MM * DECAY ** (degree - DEGREES[0]) * rng.normal(size=degree.shape)
+    return np.where(np.isin(degree, DEGREES), amplitude, 0.0)
 
 
 def make_grid(side: int) -> np.ndarray:

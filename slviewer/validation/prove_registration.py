@@ -21,7 +21,7 @@ from slviewer.fringe.sequence import one_axis
 from slviewer.geometry.rigid import fit_rigid, move_points
 from slviewer.inspection.deviation import deviation
 from slviewer.pipeline.capture_phases import decode_frames
-from slviewer.pipeline.feedback import Progress, ignore_progress, part
+from slviewer.pipeline.feedback import Progress, part
 from slviewer.pipeline.simulate import TARGET, turn_plan
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.reconstruction.reconstruct import Model, reconstruct_cloud
@@ -41,7 +41,7 @@ from slviewer.surface.fuse import fuse
 from slviewer.surface.meshing import MeshingPlan, build_mesh
 from slviewer.surface.shapes import Mesh, PointSet
 from slviewer.target.board import Board
-from slviewer.validation.proof import BandCheck, Proof, prove_checks
+from slviewer.validation.proof import BandCheck, Proof, prove_checks, track
 from slviewer.validation.rendered_calibration import calibrate_rendered, render_phase
 
 POSES = 25
@@ -109,26 +109,23 @@ def _make_row(scan: str, onto: str, pair: Registration, shift: float, turn: floa
     }
 
 
-def prove_registration(
-    scale: float = 1.0, *, poses: int = POSES, seed: int = 0, progress: Progress = ignore_progress
-) -> Proof:
+def prove_registration(scale: float, seed: int, progress: Progress) -> Proof:
     """Calibrate a rendered rig, scan and register three depths and a turn, mesh them, and try what must be refused."""
     rig = letter(scale, seed)
-    plan = turn_plan(rig, Board.parse(TARGET), poses)
-    targets = {name: scene for name, scene in plan.items() if name.startswith("pose_")}
-    model: Model = calibrate_rendered(rig, targets, part(progress, 0.0, 0.5))[1]
+    plan = turn_plan(rig, Board.parse(TARGET), POSES)
+    model: Model = calibrate_rendered(rig, plan, part(progress, 0.0, 0.5))[1]
     scans = {name: scene for name, scene in plan.items() if isinstance(scene, MeshScene)}
-    clouds, measured, true = {}, [], []
-    for i, (name, scene) in enumerate(scans.items()):
-        progress(0.5 + 0.25 * i / len(scans), name)
+    clouds: dict[str, Cloud] = {}
+    measured, true = [], []
+    for name, scene, _ in track(progress, scans, 0.5, 0.75):
         renderer = Renderer(rig, scene)
-        clouds[name] = reconstruct_cloud(model, {"x": render_phase(renderer, name, len(targets) + i)})
+        clouds[name] = reconstruct_cloud(model, {"x": render_phase(renderer, name, POSES + len(clouds))})
         known = np.flatnonzero(clouds[name].mask & renderer.truth().mask)[::_EVERY]
         measured.append(clouds[name].points.reshape(-1, 3)[known].astype(float))
         true.append(renderer.truth().points.reshape(-1, 3)[known])
     # A calibration's camera frame is a gauge: turned by a part of a milliradian it measures every distance the same.
     T_calibrated_camera = fit_rigid(np.concatenate(true), np.concatenate(measured))
-    truth = {name: T_calibrated_camera @ _to_matrix(scene.pose) for name, scene in scans.items()}
+    truth = {name: T_calibrated_camera @ scene.pose.matrix for name, scene in scans.items()}
 
     def register(kind: str, reference: str, starts: Starts | None, done: Progress) -> RegisteredScans:
         """Register all scans of one kind onto the reference, and time it."""
@@ -143,21 +140,18 @@ def prove_registration(
     checks = check_registration(depths, turn)
     progress(0.88, "fusing and meshing")
     surfaces, lines, surface_record = _check_surfaces(depths, turn, scans)
-    refusals = {}
-    for k, (what, (wanted, *pair)) in enumerate(_make_ambiguous_pairs().items()):
-        progress(0.95 + 0.01 * k, what)
-        both = {
-            name: reconstruct_cloud(model, {"x": render_phase(Renderer(rig, scene), name, 900 + k)})
+    refusals: dict[str, dict[str, str]] = {}
+    for what, (wanted, *pair), _ in track(progress, _make_ambiguous_pairs(), 0.95, 0.98):
+        reason = _describe_refusal({
+            name: reconstruct_cloud(model, {"x": render_phase(Renderer(rig, scene), name, 900 + len(refusals))})
             for name, scene in zip("ab", pair, strict=True)
-        }
-        reason = _describe_refusal(both)
+        })  # fmt: skip
         refusals[what] = {"wanted": wanted, "got": reason}
         is_right = float(reason in wanted.split("/"))
         surfaces.append(BandCheck(what, f"refused as {wanted} (it was: {reason})", is_right, 1.0, 1.0))
     for k, (what, marked) in enumerate(_make_marked_pairs().items()):
         progress(0.98, f"{what} by markers")
         surfaces.append(_check_markers(rig, model, what, marked, T_calibrated_camera, 950 + 2 * k, scale))
-    progress(1.0, "proven")
     rows = depths.rows() + turn.rows()
     checks += surfaces
     r1, r2 = the_letter.EXPERIMENT_3_ICP_RMS_MM.values()
@@ -235,10 +229,8 @@ def _describe_refusal(pair: Mapping[str, Cloud]) -> str:
 
 def _make_ambiguous_pairs() -> dict[str, tuple[str, Scene, Scene]]:
     """Two scans each that must not be registered, and the reason."""
-    near, far = np.array([0.0, 0.0, 560.0]), np.array([6.0, -4.0, 620.0])
-    first, second = (
-        Pose(rotation(np.radians(turns)), place) for turns, place in (((4.0, -6.0, 2.0), near), ((-5.0, 3.0, 6.0), far))
-    )
+    first = _make_pose((4.0, -6.0, 2.0), (0.0, 0.0, 560.0))
+    second = _make_pose((-5.0, 3.0, 6.0), (6.0, -4.0, 620.0))
     cylinder = cylinder_mesh(40.0, 150.0)
     return {
         "two scans of a plane": ("plane", blank_board(first), blank_board(second)),
@@ -247,23 +239,26 @@ def _make_ambiguous_pairs() -> dict[str, tuple[str, Scene, Scene]]:
         "scans of unrelated objects": (
             "disagree/overlap",
             demo_object(first),
-            MeshScene(*stone(), Pose(np.diag([1.0, -1.0, -1.0]), far)),
+            MeshScene(*stone(), Pose(np.diag([1.0, -1.0, -1.0]), second.t)),
         ),
     }
 
 
 def _make_marked_pairs() -> dict[str, tuple[MarkedScene, MarkedScene]]:
     """Two scans each of shapes that do not hold a pose, with coded markers on them."""
-    first, second = (
-        Pose(rotation(np.radians(turns)), np.array(place))
-        for turns, place in (((4.0, -6.0, 2.0), (0.0, 0.0, 620.0)), ((-5.0, 8.0, 16.0), (6.0, -4.0, 640.0)))
-    )
+    first = _make_pose((4.0, -6.0, 2.0), (0.0, 0.0, 620.0))
+    second = _make_pose((-5.0, 8.0, 16.0), (6.0, -4.0, 640.0))
     behind = [Pose(pose.R, pose.t + np.array([0.0, 0.0, 60.0])) for pose in (first, second)]
     return {
         "plane": (marked_plate(first), marked_plate(second)),
         "sphere": (marked_sphere(behind[0]), marked_sphere(behind[1])),
         "cylinder": (marked_cylinder(first), marked_cylinder(second)),
     }
+
+
+def _make_pose(turns_deg: tuple[float, float, float], place_mm: tuple[float, float, float]) -> Pose:
+    """The pose turned by a rotation vector, at a place in the camera's frame."""
+    return Pose(rotation(np.radians(turns_deg)), np.array(place_mm))
 
 
 def _check_markers(
@@ -284,7 +279,7 @@ def _check_markers(
         clouds[name] = reconstruct_cloud(model, phases, texture=texture(sequence, frames))
     markers = {name: measure_markers(cloud) for name, cloud in clouds.items()}
     T = register_all(clouds, "a", Starts(markers=markers)).T_reference_scan["b"]
-    true = [T_calibrated_camera @ _to_matrix(scene.pose) for scene in pair]
+    true = [T_calibrated_camera @ scene.pose.matrix for scene in pair]
     points = clouds["b"].measured[::_EVERY].astype(float)
     gap = move_points(T, points) - move_points(true[0] @ np.linalg.inv(true[1]), points)
     error = float(np.linalg.norm(gap, axis=1).max())
@@ -293,12 +288,5 @@ def _check_markers(
 
 def _measure_motion(D: np.ndarray, centre: np.ndarray) -> tuple[float, float]:
     """How far a motion (4, 4) shifts a point (3,), mm, and its angle, degrees."""
-    shift = np.linalg.norm(D[:3, :3] @ centre + D[:3, 3] - centre)
+    shift = np.linalg.norm(move_points(D, centre[None]) - centre)
     return float(shift), float(np.degrees(Rotation.from_matrix(D[:3, :3]).magnitude()))
-
-
-def _to_matrix(pose: Pose) -> np.ndarray:
-    """The pose as a transform (4, 4), mm."""
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = pose.R, pose.t
-    return T

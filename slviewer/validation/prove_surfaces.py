@@ -14,7 +14,7 @@ from slviewer.fringe.decode import decode
 from slviewer.fringe.phase import Reason
 from slviewer.fringe.presets import PRESETS
 from slviewer.fringe.sequence import PatternSequence, one_axis
-from slviewer.pipeline.feedback import Progress, ignore_progress
+from slviewer.pipeline.feedback import Progress
 from slviewer.simulation.boards import Pose
 from slviewer.simulation.concave import Indirect, bowl, groove, wax
 from slviewer.simulation.plans import objects, planes, rotation, spheres
@@ -22,7 +22,7 @@ from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import letter
 from slviewer.simulation.scenes import Scene
 from slviewer.simulation.truth import PerfectModel
-from slviewer.validation.proof import BandCheck, Proof, prove_checks
+from slviewer.validation.proof import BandCheck, Proof, prove_checks, root_mean_square, track
 
 LEAST_GAIN = 5.0
 """Of p18's error over micro's, RMS without any mask, in the groove that is judged."""
@@ -79,12 +79,10 @@ def surface_cases() -> dict[str, tuple[Scene, bool]]:
         "unsharp sphere": spheres()["sphere_1"],
         "unsharp object": objects()["object_r1"],
     }
-    return {name: (scene, True) for name, scene in lit.items()} | {
-        name: (scene, False) for name, scene in clean.items()
-    }
+    return {name: (scene, name in lit) for name, scene in (lit | clean).items()}
 
 
-def prove_surfaces(scale: float = 0.5, *, seed: int = 0, progress: Progress = ignore_progress) -> Proof:
+def prove_surfaces(scale: float, seed: int, progress: Progress) -> Proof:
     """Measure every surface with p18, complementary, multifrequency and micro; judge gain, mask and false alarms.
 
     ``scale``: resolution of the camera, as a share of the Letter's.
@@ -94,9 +92,7 @@ def prove_surfaces(scale: float = 0.5, *, seed: int = 0, progress: Progress = ig
     rows: list[Row] = []
     record: dict[str, dict[str, dict[str, float]]] = {}
     checks: list[BandCheck] = []
-    cases = surface_cases()
-    for k, (name, (scene, is_indirect)) in enumerate(cases.items()):
-        progress(k / len(cases), name)
+    for name, (scene, is_indirect), _ in track(progress, surface_cases()):
         blurred = replace(rig, light=replace(rig.light, defocus_px_mm=DEFOCUS * rig.light.defocus_px_mm))
         renderer = Renderer(blurred if name.startswith("unsharp") else rig, scene)
         errors = {
@@ -110,17 +106,9 @@ def prove_surfaces(scale: float = 0.5, *, seed: int = 0, progress: Progress = ig
             checks.append(BandCheck(name, f"good points masked with {worst}", errors[worst].lost, 0.0, MOST_LOST))
         if name == JUDGED:
             gain = errors["p18"].rms_mm / errors["micro"].rms_mm
+            caught, what = errors["p18"].gross_caught, f"share of p18's points over {GROSS_PX:g} px wrong masked"
             checks.append(BandCheck(name, "error of p18 over that of micro", gain, LEAST_GAIN, np.inf))
-            checks.append(
-                BandCheck(
-                    name,
-                    f"share of p18's points over {GROSS_PX:g} px wrong masked",
-                    errors["p18"].gross_caught,
-                    LEAST_CAUGHT,
-                    1.0,
-                )
-            )
-    progress(1.0, "proven")
+            checks.append(BandCheck(name, what, caught, LEAST_CAUGHT, 1.0))
     gains = ", ".join(f"{name} {each['p18']['rms_mm'] / each['micro']['rms_mm']:.1f}" for name, each in record.items())
     return prove_checks(checks, scale, rows, {"surfaces": record}, below=[f"p18's RMS over micro's: {gains}"])
 
@@ -141,10 +129,11 @@ def measure_errors(
     wrong = valid & (off > WRONG_SIGMAS * plain.sigma_px)
     gross = valid & (off > GROSS_PX)
     return SequenceErrors(
-        _rms(error[valid]), _rms(error[valid & ~masked]), float(np.mean(wrong[valid])),
-        float(np.mean(masked[wrong])) if wrong.any() else np.nan,
-        float(np.mean(masked[gross])) if gross.any() else np.nan, float(np.mean(masked[valid & ~wrong])),
-    )  # fmt: skip
+        root_mean_square(error[valid]),
+        root_mean_square(error[valid & ~masked]),
+        float(np.mean(wrong[valid])),
+        *(float(np.mean(masked[points])) if points.any() else np.nan for points in (wrong, gross, valid & ~wrong)),
+    )
 
 
 def _make_row(name: str, preset: str, errors: SequenceErrors) -> Row:
@@ -152,15 +141,10 @@ def _make_row(name: str, preset: str, errors: SequenceErrors) -> Row:
     return {
         "surface": name,
         "patterns": preset,
-        "RMS mm": round(errors.rms_mm, 3),
-        "with mask": round(errors.masked_rms_mm, 3),
+        "RMS mm": errors.rms_mm,
+        "with mask": errors.masked_rms_mm,
         ">5 sigma %": round(100 * errors.wrong, 2),
-        "of these masked %": round(100 * errors.caught, 1),
-        "gross masked %": round(100 * errors.gross_caught, 1),
+        "of these masked %": 100 * errors.caught,
+        "gross masked %": 100 * errors.gross_caught,
         "good masked %": round(100 * errors.lost, 2),
     }
-
-
-def _rms(values: np.ndarray) -> float:
-    """Return the root of the mean square; NaN without values."""
-    return float(np.sqrt(np.mean(values**2))) if values.size else float("nan")

@@ -1,6 +1,6 @@
 """Whether the splined calibration predicts its own errors, on simulated rigs with known truth."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,12 +18,12 @@ from slviewer.calibration.splined.volume import (
     working_volume,
 )
 from slviewer.fringe.sequence import Axis
-from slviewer.pipeline.feedback import Progress, ignore_progress, part
+from slviewer.pipeline.feedback import Progress
 from slviewer.pipeline.simulate import TARGET
 from slviewer.simulation.plans import letter_plan
 from slviewer.simulation.rig import SimulatedRig
 from slviewer.target.board import Board
-from slviewer.validation.proof import Proof
+from slviewer.validation.proof import Proof, root_mean_square, track
 from slviewer.validation.prove_accuracy import rig_cases
 from slviewer.validation.rendered_calibration import calibrate_rendered
 
@@ -45,54 +45,42 @@ class PredictedErrors:
 
     def row(self, rig: str) -> dict[str, Any]:
         """The figures in mm; NaN where target poses support everything."""
-        rms = {
-            (what, where): float(np.sqrt(np.mean(errors[self.supported == where] ** 2)))
-            if (self.supported == where).any()
-            else float("nan")
-            for what, errors in (("predicted", self.predicted), ("true", self.true))
-            for where in (True, False)
-        }
+        inside, elsewhere = self.supported, ~self.supported
+        predicted, true = root_mean_square(self.predicted[inside]), root_mean_square(self.true[inside])
         return {
             "rig": rig,
-            "supported": float(np.mean(self.supported)),
-            "predicted": rms["predicted", True],
-            "true": rms["true", True],
-            "ratio": rms["predicted", True] / rms["true", True],
-            "below_2_sigma": float(np.mean((self.true < 2 * self.predicted)[self.supported])),
-            "ratio_elsewhere": rms["predicted", False] / rms["true", False],
+            "supported": float(np.mean(inside)),
+            "predicted": predicted,
+            "true": true,
+            "ratio": predicted / true,
+            "below_2_sigma": float(np.mean((self.true < 2 * self.predicted)[inside])),
+            "ratio_elsewhere": root_mean_square(self.predicted[elsewhere]) / root_mean_square(self.true[elsewhere]),
         }
 
 
-def prove_uncertainty(
-    scale: float = 0.5, *, poses: int = POSES, seed: int = 0, progress: Progress = ignore_progress
-) -> Proof:
+def prove_uncertainty(scale: float, seed: int, progress: Progress) -> Proof:
     """Calibrate rigs of different lenses and boards from rendered captures, and compare what each predicts of its
     errors with these. ``scale``: resolution of the camera, as a share of the Letter's.
 
     Raises CalibrationRejected where one cannot be calibrated.
     """
     rigs = {}
-    for k, case in enumerate(chosen := rig_cases(seed)):
-        report = part(progress, k / len(chosen), (k + 1) / len(chosen), case.name)
+    for name, case, report in track(progress, {case.name: case for case in rig_cases(seed)}):
         rig = case.rig(scale)
-        plan = letter_plan(rig, Board.parse(TARGET), poses, case.shape)
-        targets = {name: scene for name, scene in plan.items() if name.startswith("pose_")}
-        rigs[case.name] = compare_with_truth(calibrate_rendered(rig, targets, report)[1], rig)
-    progress(1.0, "proven")
-    return judge_uncertainty(rigs, scale, poses)
+        plan = letter_plan(rig, Board.parse(TARGET), POSES, case.shape)
+        rigs[name] = compare_with_truth(calibrate_rendered(rig, plan, report)[1], rig)
+    return judge_uncertainty(rigs, scale, POSES)
 
 
 def judge_uncertainty(rigs: Mapping[str, PredictedErrors], scale: float, poses: int) -> Proof:
     """The proof: whether the ratio of predicted to true errors, pooled over the rigs, lies in ``BAND``."""
-    every = list(rigs.values())
-    pooled = PredictedErrors(*(_concatenate_field(every, what) for what in ("predicted", "true", "supported"))).row(
-        "pooled"
-    )
-    rows = [each.row(name) for name, each in rigs.items()] + ([pooled] if len(every) > 1 else [])
+    fields = zip(*(vars(each).values() for each in rigs.values()), strict=True)
+    pooled = PredictedErrors(*map(np.concatenate, fields)).row("pooled")
+    rows = [each.row(name) for name, each in rigs.items()] + ([pooled] if len(rigs) > 1 else [])
     table = [
         {
             "rig": row["rig"],
-            "supported %": round(100 * row["supported"], 1),
+            "supported %": 100 * row["supported"],
             "predicted um": round(1000 * row["predicted"], 1),
             "true um": round(1000 * row["true"], 1),
             "predicted / true": round(row["ratio"], 2),
@@ -103,7 +91,7 @@ def judge_uncertainty(rigs: Mapping[str, PredictedErrors], scale: float, poses: 
     ]
     holds = BAND[0] <= pooled["ratio"] <= BAND[1]
     line = (
-        f"predicted over true 3D error, pooled over {len(every)} rigs of {poses} poses at scale {scale:g}: "
+        f"predicted over true 3D error, pooled over {len(rigs)} rigs of {poses} poses at scale {scale:g}: "
         f"{pooled['ratio']:.2f} {'lies' if holds else 'does NOT lie'} between {BAND[0]} and {BAND[1]}; "
         f"where no pose captures {pooled['ratio_elsewhere']:.2f}"
     )
@@ -138,8 +126,3 @@ def true_errors(true: SimulatedRig, rig: Arrangement, volume: Volume, axis: Axis
         here, there = (view_pixels(rig, volume.pixels, depths)[1][:, row] for depths in (z, 1.0001 * z))
         z = z + 1e-4 * z * (measured - here) / (there - here)
     return view_pixels(rig, volume.pixels, z)[0] - points
-
-
-def _concatenate_field(rigs: Sequence[PredictedErrors], what: str) -> np.ndarray:
-    """The field ``what`` (n,) of all rigs, concatenated."""
-    return np.concatenate([getattr(rig, what) for rig in rigs])

@@ -19,6 +19,7 @@ from slviewer.simulation.rig import SimulatedRig
 from slviewer.simulation.scenes import Scene
 from slviewer.target.board import Board
 from slviewer.target.detect import detect
+from slviewer.validation.proof import track
 
 
 @dataclass(frozen=True)
@@ -38,19 +39,20 @@ DEFAULT_SETTINGS = CalibrationSettings()
 
 def calibrate_rendered(
     rig: SimulatedRig,
-    targets: Mapping[str, Scene],
+    plan: Mapping[str, Scene],
     progress: Progress = ignore_progress,
     settings: CalibrationSettings = DEFAULT_SETTINGS,
 ) -> tuple[StereoModel, SplinedModel, list[Observation]]:
-    """Render target poses, numbered in their order, and calibrate the stereo and the splined model from them.
+    """Render the target poses of a plan, numbered in their order, and calibrate the stereo and the splined model.
 
     Returns both models, and the observations with circles at their centres. Raises CalibrationRejected where the
     poses do not determine the rig.
     """
-    observations = []
-    for i, (name, scene) in enumerate(targets.items()):
-        progress(0.8 * i / len(targets), name)
-        observations.append(observe_rendered(rig, scene, name, i, settings))
+    targets = {name: scene for name, scene in plan.items() if name.startswith("pose_")}
+    observations = [
+        observe_rendered(rig, scene, name, i, settings)
+        for i, (name, scene, _) in enumerate(track(progress, targets, 0.0, 0.8))
+    ]
     progress(0.8, "calibrating")
     return calibrate_observed(rig, observations, settings)
 

@@ -9,8 +9,7 @@ from facts import missing_facts
 
 from slviewer.cli import main
 from slviewer.devices.drivers import Driver, drivers
-from slviewer.devices.opening import Openable
-from slviewer.devices.protocols import CameraSettings
+from slviewer.devices.protocols import CameraSettings, Openable
 from slviewer.devices.simulated import preset_rig
 from slviewer.pipeline.rig_presets import save_rig
 from slviewer.session.store import Session

@@ -12,8 +12,7 @@ from playwright.sync_api import Browser
 
 from slviewer.cli import main
 from slviewer.devices.drivers import Driver, drivers
-from slviewer.devices.opening import Openable
-from slviewer.devices.protocols import CameraSettings
+from slviewer.devices.protocols import CameraSettings, Openable
 from slviewer.session.store import Session
 from slviewer.session.toml import to_toml
 

@@ -20,9 +20,9 @@ genicam = pytest.importorskip("genicam", reason="the optional package genicam is
 pytest.importorskip("harvesters", reason="the optional package harvesters is not installed")
 
 from slviewer.devices import genicam as driver_module  # noqa: E402
-from slviewer.devices.capture import capture, capture_texture  # noqa: E402
+from slviewer.devices.capture import capture_colour, capture_frames  # noqa: E402
 from slviewer.devices.drivers import driver  # noqa: E402
-from slviewer.devices.genicam import IN_FLIGHT, GenicamCamera, genicam_camera, list_connected  # noqa: E402
+from slviewer.devices.genicam import IN_FLIGHT, GenicamCamera, list_genicam_cameras  # noqa: E402
 from slviewer.devices.genicam_features import Features  # noqa: E402
 from slviewer.devices.gentl import PRODUCERS_VARIABLE  # noqa: E402
 from slviewer.devices.protocols import CameraSettings, ColourCamera, Rig  # noqa: E402
@@ -41,7 +41,7 @@ def installed(monkeypatch):
 
 @pytest.fixture
 def camera():
-    camera = genicam_camera(serial=0)
+    camera = GenicamCamera(serial=0)
     camera.open()
     yield camera
     camera.close()
@@ -72,15 +72,15 @@ def column(frame: np.ndarray) -> float:
 
 
 def test_cameras_are_found_and_chosen():
-    assert list_connected() == [f"Machine Vision Games Ltd. Viky, serial {k}" for k in range(3)]
-    assert driver("genicam").list_connected is list_connected and driver("genicam").camera is genicam_camera
+    assert list_genicam_cameras() == [f"Machine Vision Games Ltd. Viky, serial {k}" for k in range(3)]
+    assert driver("genicam").list_connected is list_genicam_cameras and driver("genicam").camera is GenicamCamera
     with raises(InputError, 3, "serial 0", "serial 1", "serial 2"):
-        genicam_camera()
+        GenicamCamera()
     with raises(InputError, 3, "serial 0", "serial 1", "serial 2"):
-        genicam_camera(model="viky")
+        GenicamCamera(model="viky")
     with pytest.raises(DeviceError):
-        genicam_camera(serial="23")
-    camera = genicam_camera(serial="1", producer=str(VIKY))
+        GenicamCamera(serial="23")
+    camera = GenicamCamera(serial="1", producer=str(VIKY))
     assert camera.name == "the camera Machine Vision Games Ltd. Viky, serial 1"
     assert (camera.size, camera.dtype) == ((400, 400), np.uint8)
 
@@ -89,15 +89,15 @@ def test_producers_that_are_missing_or_broken_are_named(monkeypatch, tmp_path):
     broken = tmp_path / "broken.cti"
     broken.write_text("no library")
     with raises(InputError, ".cti"):
-        genicam_camera(producer=str(tmp_path / "none.cti"))
+        GenicamCamera(producer=str(tmp_path / "none.cti"))
     with raises(DeviceError, "broken.cti"):
-        genicam_camera(producer=str(broken))
+        GenicamCamera(producer=str(broken))
     monkeypatch.setenv(PRODUCERS_VARIABLE, f"{tmp_path}:{VIKY.parent}:{tmp_path}")
-    assert len(list_connected()) == 3
+    assert len(list_genicam_cameras()) == 3
     for folders in (str(tmp_path / "nothing"), ""):
         monkeypatch.setenv(PRODUCERS_VARIABLE, folders)
         with pytest.raises(DeviceError):
-            list_connected()
+            list_genicam_cameras()
 
 
 @pytest.mark.computes
@@ -126,7 +126,7 @@ def test_frames_that_waited_are_not_returned(camera):
 @pytest.mark.parametrize(("serial", "colour"), [(0, "red"), (1, "green"), (2, "blue")])
 def test_colours_and_the_channel_that_is_decoded(serial, colour):
     rgb = [255 * (colour == name) for name in ("red", "green", "blue")]
-    camera = genicam_camera(serial=serial, channel=colour)
+    camera = GenicamCamera(serial=serial, channel=colour)
     assert isinstance(camera, ColourCamera)
     camera.open()
     try:
@@ -147,7 +147,7 @@ def test_colours_and_the_channel_that_is_decoded(serial, colour):
 
 
 def test_mono_is_one_number_a_pixel():
-    camera = genicam_camera(serial=0, pixel_format="Mono8")
+    camera = GenicamCamera(serial=0, pixel_format="Mono8")
     assert not isinstance(camera, ColourCamera)
     camera.open()
     try:
@@ -162,9 +162,9 @@ def test_a_capture_of_a_sequence(camera):
     sequence = gray(projector.size)
     rig = Rig("bench", fast(camera), projector)
     projector.open()
-    frames = capture(rig, sequence)
+    frames = capture_frames(rig, sequence)
     assert len(np.unique([column(frame) for frame in frames])) > len(frames) - 3
-    assert capture_texture(rig).shape == (400, 400, 3)
+    assert capture_colour(rig).shape == (400, 400, 3)
 
 
 def test_what_the_camera_lacks_is_said(camera):
@@ -178,11 +178,11 @@ def test_what_the_camera_lacks_is_said(camera):
         ({"channel": "infrared"}, ("infrared", "red", "green", "blue", "grey")),
     ):
         with raises(InputError, *lacks):
-            genicam_camera(serial=1, **options)
+            GenicamCamera(serial=1, **options)
 
 
 def test_a_camera_opens_again_and_again():
-    camera = genicam_camera(serial=0)
+    camera = GenicamCamera(serial=0)
     for _ in range(3):
         with pytest.raises(DeviceError):
             camera.grab(np.zeros((400, 400), np.uint8))
@@ -196,12 +196,12 @@ def test_a_camera_opens_again_and_again():
 
 def test_cameras_of_one_producer_are_used_side_by_side(camera):
     first = fast(camera)
-    again = genicam_camera(serial=0)  # can be chosen anew while it is open, as with other options
+    again = GenicamCamera(serial=0)  # can be chosen anew while it is open, as with other options
     with pytest.raises(DeviceError):
         again.open()
-    second = genicam_camera(serial=2)
+    second = GenicamCamera(serial=2)
     second.open()
-    assert len(list_connected()) == 3
+    assert len(list_genicam_cameras()) == 3
     column(grabbed(first))
     column(grabbed(fast(second)))
     second.close()
@@ -277,7 +277,7 @@ def test_nothing_of_a_closed_camera_stays(camera):
 
 def test_interrupts_and_other_threads_go_on_while_it_waits():
     before = signal.getsignal(signal.SIGINT)
-    camera = genicam_camera(serial=0)
+    camera = GenicamCamera(serial=0)
     camera.open()
     ticks, done = [0], threading.Event()
 

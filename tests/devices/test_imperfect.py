@@ -6,7 +6,7 @@ from clocks import SteppingClock
 from facts import raises
 from imperfect_rig import Imperfections, imperfect, resampled_rig
 
-from slviewer.devices.capture import capture
+from slviewer.devices.capture import capture_frames
 from slviewer.devices.protocols import CameraSettings
 from slviewer.devices.replay import replay
 from slviewer.devices.simulated import preset_rig
@@ -35,7 +35,7 @@ LAST = len(FRAMES) - 1
 def test_the_frames_come_as_the_fault_says(wrong, shown):
     rig, _ = imperfect(replay(FRAMES, SEQUENCE), wrong)
     with rig.opened():
-        assert np.array_equal(capture(rig, SEQUENCE), FRAMES[list(shown)])
+        assert np.array_equal(capture_frames(rig, SEQUENCE), FRAMES[list(shown)])
 
 
 def test_light_that_is_late_shows_the_frame_before_until_it_comes():
@@ -96,5 +96,5 @@ def test_a_display_that_scales_makes_fine_stripes_grey():
         sequence = gray(rig.projector.size)
         plain = preset_rig(scale=0.1)
         with plain.opened():
-            same = np.abs(capture(rig, sequence).astype(int) - capture(plain, sequence)).mean(axis=(1, 2))
+            same = np.abs(capture_frames(rig, sequence).astype(int) - capture_frames(plain, sequence)).mean(axis=(1, 2))
     assert same[-1] < 2 < same[0]

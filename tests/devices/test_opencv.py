@@ -20,8 +20,7 @@ from slviewer.devices.drivers import driver
 from slviewer.devices.opencv import OpenCVCamera
 from slviewer.devices.opencv_reader import StreamTiming
 from slviewer.devices.opencv_source import list_sysfs_webcams
-from slviewer.devices.opening import Openable
-from slviewer.devices.protocols import CameraSettings, ColourCamera, Rig, check_index, check_level
+from slviewer.devices.protocols import CameraSettings, ColourCamera, Openable, Rig, check_index, check_level
 from slviewer.errors import DeviceError, InputError
 from slviewer.fringe.presets import gray
 from slviewer.fringe.sequence import PatternSequence

@@ -13,7 +13,7 @@ from slviewer.devices import opencv as opencv_module
 from slviewer.devices.opencv import OpenCVCamera
 from slviewer.devices.opencv_controls import dialect_of, disable_automatics, exposure_ms, set_exposure
 from slviewer.devices.opencv_reader import Connected, Pace, StreamTiming
-from slviewer.devices.opencv_source import connect
+from slviewer.devices.opencv_source import connect_source
 from slviewer.devices.protocols import CameraSettings
 
 SIZE = (160, 120)
@@ -95,9 +95,9 @@ def plugged(monkeypatch):
 
         def plug(controls, stubborn=()):
             def instead(source, size, timing):
-                return Connected(Webcam(connect(seen.url, None).capture, "V4L2", controls, stubborn), live=True)
+                return Connected(Webcam(connect_source(seen.url, None).capture, "V4L2", controls, stubborn), live=True)
 
-            monkeypatch.setattr(opencv_module, "connect", instead)
+            monkeypatch.setattr(opencv_module, "connect_source", instead)
 
         yield plug
 
@@ -153,7 +153,9 @@ def test_a_camera_without_colour_is_read_as_it_is(monkeypatch):
                 return read, image[..., 0].copy()
 
         monkeypatch.setattr(
-            opencv_module, "connect", lambda *_: Connected(Grey(connect(seen.url, None).capture, "V4L2", {}), live=True)
+            opencv_module,
+            "connect_source",
+            lambda *_: Connected(Grey(connect_source(seen.url, None).capture, "V4L2", {}), live=True),
         )
         camera = OpenCVCamera(0, SIZE, timing=QUICK)
         camera.open()

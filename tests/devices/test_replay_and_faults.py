@@ -6,7 +6,7 @@ from facts import raises
 from faulty_rig import breakable
 
 from slviewer.devices import drivers as drivers_module
-from slviewer.devices.capture import capture
+from slviewer.devices.capture import capture_frames
 from slviewer.devices.drivers import Driver, available, driver, drivers
 from slviewer.devices.protocols import CameraSettings, Rig
 from slviewer.devices.replay import Recording, recording_rig, replay
@@ -32,7 +32,7 @@ def grabbed(rig: Rig) -> np.ndarray:
 def test_replay_gives_back_what_was_recorded(dtype):
     frames = recorded(SEQUENCE, dtype=dtype)
     with replay(frames, SEQUENCE).opened() as rig:
-        again = capture(rig, SEQUENCE)
+        again = capture_frames(rig, SEQUENCE)
         assert again.dtype == dtype and np.array_equal(again, frames)
         rig.projector.show(7)
         assert np.array_equal(grabbed(rig), frames[7])
@@ -55,7 +55,7 @@ def test_replay_refuses_another_sequence_and_says_so():
     with replay(recorded(SEQUENCE), SEQUENCE).opened() as rig:
         for other in (gray(PROJECTOR), p18((60, 48)), PatternSequence(PROJECTOR, SEQUENCE.frames, phase_sign=-1)):
             with pytest.raises(DeviceError):
-                capture(rig, other)
+                capture_frames(rig, other)
         with pytest.raises(DeviceError):
             rig.projector.show(0)
 
@@ -69,8 +69,8 @@ def test_replay_plays_one_capture_after_another_but_never_a_mixture():
             recording.play(second, SEQUENCE)
 
     with recording_rig(recording).opened() as rig:
-        assert np.array_equal(capture(rig, SEQUENCE, progress=change), first)
-        assert np.array_equal(capture(rig, SEQUENCE), second)
+        assert np.array_equal(capture_frames(rig, SEQUENCE, progress=change), first)
+        assert np.array_equal(capture_frames(rig, SEQUENCE), second)
     with pytest.raises(InputError):
         recording.play(recorded(SEQUENCE, dtype=np.uint16), SEQUENCE)
     with pytest.raises(InputError):
@@ -84,9 +84,9 @@ def test_a_timeout_ends_this_capture_only():
         faults.plan("timeout", 7)
         done = []
         with raises(DeviceError, "8 of 52", "2 s"):
-            capture(rig, SEQUENCE, progress=lambda k, n: done.append(k))
+            capture_frames(rig, SEQUENCE, progress=lambda k, n: done.append(k))
         assert done[-1] == 7
-        assert np.array_equal(capture(rig, SEQUENCE), frames)
+        assert np.array_equal(capture_frames(rig, SEQUENCE), frames)
 
 
 @pytest.mark.parametrize(("fault", "broken"), [("unplugged", "camera"), ("projector", "projector")])
@@ -98,11 +98,11 @@ def test_an_unplugged_device_works_again_once_it_is_reopened(fault, broken):
         faults.plan(fault, 3)
         grabbed(rig)  # a preview sets nothing off
         with raises(DeviceError, "4 of 52", broken):
-            capture(rig, SEQUENCE)
+            capture_frames(rig, SEQUENCE)
         with raises(DeviceError, broken):
-            capture(rig, SEQUENCE)
+            capture_frames(rig, SEQUENCE)
     with rig.opened():
-        assert np.array_equal(capture(rig, SEQUENCE), frames)
+        assert np.array_equal(capture_frames(rig, SEQUENCE), frames)
     with raises(InputError, "lightning"):
         faults.plan("lightning", 0)
 
@@ -114,7 +114,7 @@ def test_a_rig_opens_as_a_whole_or_not_at_all():
         rig.open()
     rig.camera.close()
     with rig.opened():
-        assert np.array_equal(capture(rig, SEQUENCE)[0], recorded(SEQUENCE)[0])
+        assert np.array_equal(capture_frames(rig, SEQUENCE)[0], recorded(SEQUENCE)[0])
 
 
 def test_drivers_are_found_by_name():
@@ -137,4 +137,4 @@ def test_a_driver_without_its_package_says_how_to_install_it(monkeypatch):
 def test_a_frame_without_patterns_is_no_capture():
     rig = replay(np.zeros((1, 4, 4), np.uint8), PatternSequence(PROJECTOR, (Frame("white"),)))
     with rig.opened(), raises(DeviceError, "patterns"):
-        capture(rig, PatternSequence(PROJECTOR, ()))
+        capture_frames(rig, PatternSequence(PROJECTOR, ()))

@@ -8,7 +8,7 @@ import pytest
 from clocks import SteppingClock
 from facts import raises
 
-from slviewer.devices.capture import capture
+from slviewer.devices.capture import capture_frames
 from slviewer.devices.protocols import CameraSettings, Rig
 from slviewer.devices.simulated import AUTO, preset_rig, simulated_rig
 from slviewer.devices.world import SETTLED_S, SimulatedWorld
@@ -49,7 +49,7 @@ def seen(rig: Rig) -> np.ndarray:
 def test_a_capture_decodes_to_the_truth(world, rig):
     world.place("plane", Pose(rotation(np.array([0.2, -0.3, 0])), np.array([0, 0, 600.0])))
     sequence = complementary(PROJECTOR)
-    frames = capture(rig, sequence)
+    frames = capture_frames(rig, sequence)
     truth = Renderer(world.rig, world.scene).truth()
     inner = truth.mask.copy()  # beside the plate's rim, pixels mix it with the dark
     for axis in (0, 1):
@@ -71,7 +71,7 @@ def test_frames_arrive_in_place_in_order_and_with_progress(world, rig):
     width, height = rig.camera.size
     out = np.zeros((len(sequence.frames), height, width), np.uint8)
     done = []
-    assert capture(rig, sequence, out, lambda k, n: done.append((k, n))) is out
+    assert capture_frames(rig, sequence, out, lambda k, n: done.append((k, n))) is out
     assert done == [(k, len(out)) for k in range(len(out) + 1)]
     expected = Renderer(world.rig, world.scene).capture(sequence, seed=9)
     sensor = world.rig.sensor
@@ -89,7 +89,7 @@ def test_the_same_captures_have_the_same_noise_previews_or_not(world):
             rig.projector.show_level(200)
             for _ in range(previews):
                 seen(rig)
-            stacks.append((capture(rig, WHITE)[0], capture(rig, WHITE)[0]))
+            stacks.append((capture_frames(rig, WHITE)[0], capture_frames(rig, WHITE)[0]))
     assert np.array_equal(stacks[0], stacks[1])
     assert not np.array_equal(*stacks[0])
 
@@ -168,7 +168,7 @@ def test_a_draft_shows_the_board_where_it_is_and_captures_are_never_drafts():
         found = detect(world.board, draft)
         truth = world.rig.camera.project(world.pose.to_camera(world.scene.features))[found.ids]
         assert np.abs(found.pixels - truth).max() < 0.2
-        full = capture(rig, WHITE)[0]
+        full = capture_frames(rig, WHITE)[0]
         assert np.abs(np.diff(full.astype(float))).mean() > 1.05 * np.abs(np.diff(draft.astype(float))).mean()
         time.sleep(SETTLED_S + 0.01)
         rig.projector.show_level(255)
@@ -223,7 +223,7 @@ def test_the_board_may_move_in_another_thread_during_a_capture(world, rig):
     mover = threading.Thread(target=move)
     mover.start()
     try:
-        frames = capture(rig, PatternSequence(PROJECTOR, (Frame("white"),) * 8))
+        frames = capture_frames(rig, PatternSequence(PROJECTOR, (Frame("white"),) * 8))
     finally:
         stop.set()
         mover.join()
@@ -236,8 +236,8 @@ def test_cancelling_ends_the_capture_and_leaves_the_rig_usable(rig):
             raise Cancelled("stopped by the operator")
 
     with pytest.raises(Cancelled):
-        capture(rig, p18(PROJECTOR), progress=stop)
-    assert capture(rig, WHITE)[0].max() > 150
+        capture_frames(rig, p18(PROJECTOR), progress=stop)
+    assert capture_frames(rig, WHITE)[0].max() > 150
 
 
 def test_wrong_use_is_refused_in_words(world):
@@ -253,9 +253,9 @@ def test_wrong_use_is_refused_in_words(world):
         with pytest.raises(DeviceError):
             rig.projector.show(0)
         with raises(InputError, "912x1140"):
-            capture(rig, p18((800, 600)))
+            capture_frames(rig, p18((800, 600)))
         with raises(InputError, "frames"):
-            capture(rig, WHITE, np.zeros((2, 3, 4), np.uint8))
+            capture_frames(rig, WHITE, np.zeros((2, 3, 4), np.uint8))
         with raises(InputError, "shape"):
             rig.camera.grab(np.zeros((3, 4), np.uint8))
         with pytest.raises(InputError):
@@ -275,6 +275,6 @@ def test_a_steady_lamp_is_steady_and_a_flickering_one_is_not(world):
     for flicker in (0.0, 0.02):
         lamp = replace(world.rig, light=replace(world.rig.light, flicker=flicker))
         with simulated_rig(SimulatedWorld(lamp)).opened() as rig:
-            frames = capture(rig, PatternSequence(PROJECTOR, (Frame("white"),) * 12))
+            frames = capture_frames(rig, PatternSequence(PROJECTOR, (Frame("white"),) * 12))
         spread[flicker] = frames.mean((1, 2)).std() / frames.mean()
     assert spread[0.0] < 1e-3 and 0.008 < spread[0.02] < 0.04

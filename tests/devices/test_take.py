@@ -8,7 +8,7 @@ from facts import raises
 from faulty_rig import breakable
 
 from slviewer.devices.browser_projector import BrowserProjector, ProjectorChannel
-from slviewer.devices.capture import capture, capture_texture, capture_with_texture
+from slviewer.devices.capture import capture_colour, capture_frames, capture_with_texture
 from slviewer.devices.protocols import CameraSettings, ColourCamera, Rig
 from slviewer.devices.replay import replay
 from slviewer.devices.screen import Screen
@@ -48,7 +48,7 @@ def test_one_exposure_is_what_capture_gives():
     with rig().opened() as one:
         taken = capture_with_texture(one, SEQUENCE)
     with rig().opened() as other:
-        np.testing.assert_array_equal(taken.frames, capture(other, SEQUENCE))
+        np.testing.assert_array_equal(taken.frames, capture_frames(other, SEQUENCE))
     assert taken.exposures_ms == () and taken.settings == CameraSettings(1.0, 1.0)
 
 
@@ -79,7 +79,7 @@ def test_exposures_that_cannot_be_are_refused():
                 capture_with_texture(one, SEQUENCE, exposures)
         with raises(DeviceError, "100 ms", "500 ms"):
             capture_with_texture(one, SEQUENCE, (200.0, 500.0))
-        frames = capture(one, SEQUENCE)
+        frames = capture_frames(one, SEQUENCE)
     with replay(frames, SEQUENCE).opened() as recorded:
         with pytest.raises(DeviceError):
             capture_with_texture(recorded, SEQUENCE, (1.0, 2.0))
@@ -103,7 +103,7 @@ def test_a_colour_camera_brings_its_colours_home():
         taken = capture_with_texture(one, SEQUENCE)
         assert taken.texture is None and taken.frames.any()  # the frames are whole
     with rig().opened() as grey:
-        assert capture_texture(grey) is None
+        assert capture_colour(grey) is None
 
 
 class _Page:
@@ -149,10 +149,10 @@ def test_a_driver_that_fails_in_its_own_way_is_named():
     good = rig()
     failing = Rig("failing", Failing(WORLD), good.projector)
     with failing.opened(), raises(DeviceError, "frame 1", "the sensor says 7"):
-        capture(failing, SEQUENCE)
+        capture_frames(failing, SEQUENCE)
     with failing.opened(), pytest.raises(Cancelled):
 
         def stop(done, of):
             raise Cancelled("enough")
 
-        capture(failing, SEQUENCE, progress=stop)
+        capture_frames(failing, SEQUENCE, progress=stop)

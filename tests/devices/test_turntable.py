@@ -17,7 +17,7 @@ from slviewer.errors import Cancelled, DeviceError, InputError, TurntableError
 from slviewer.pipeline.rig_choice import set_up
 from slviewer.pipeline.rig_presets import check_choice, load_rig
 from slviewer.pipeline.turn import place_object
-from slviewer.preflight.turntable import check_turntable
+from slviewer.preflight.turntable import check_turning
 from slviewer.simulation.rig import letter
 
 FAST: dict[str, Any] = {"speed_deg_s": 6000.0, "settle_ms": 0.0, "boot_s": 60.0, "reply_s": 60.0}
@@ -76,7 +76,7 @@ def test_a_turntable_turns_where_it_is_asked_to(table: Turntable) -> None:
 
 def check_turntable_closed(table: Turntable) -> Any:
     table.close()
-    return check_turntable(table)
+    return check_turning(table)
 
 
 def test_a_cancelled_motion_stops(controller: Controller | None) -> None:
@@ -182,7 +182,7 @@ def test_a_controller_that_cannot_turn_is_not_opened(fault: Fault, facts: tuple[
             table.open()
         with raises(DeviceError, "not open"):
             table.position_deg()
-        check = check_turntable(table)
+        check = check_turning(table)
         assert check.verdict == "bad" and check.remedy
 
 

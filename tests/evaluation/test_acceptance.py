@@ -78,7 +78,9 @@ def bars():
 
 def outcome(artefact, bars, model):
     return conclude_test(
-        artefact, "stereo", [measure_artefact(artefact, reconstruct_cloud(model, p), words, words, R2) for words, p in bars]
+        artefact,
+        "stereo",
+        [measure_artefact(artefact, reconstruct_cloud(model, p), words, words, R2) for words, p in bars],
     )
 
 

@@ -10,7 +10,7 @@ import pytest
 from facts import missing_facts
 from fringe_scene import variants
 
-from slviewer.devices.capture import capture
+from slviewer.devices.capture import capture_frames
 from slviewer.devices.protocols import Rig
 from slviewer.devices.simulated import simulated_rig
 from slviewer.devices.world import SimulatedWorld, Thing
@@ -74,7 +74,7 @@ def rig_before(thing: Thing, gamma: float) -> Rig:
 def taken(name: str, thing: Thing = "board", gamma: float = 1.0) -> Capture:
     rig, sequence = rig_before(thing, gamma), SEQUENCES[name]()
     with rig.opened():
-        frames = capture(rig, sequence)
+        frames = capture_frames(rig, sequence)
     frames.setflags(write=False)
     return sequence, frames
 

@@ -11,7 +11,7 @@ from facts import missing_facts
 from fringe_scene import variants
 
 from slviewer.cli import main
-from slviewer.devices.capture import capture
+from slviewer.devices.capture import capture_frames
 from slviewer.devices.protocols import Rig
 from slviewer.devices.simulated import simulated_rig
 from slviewer.devices.world import SimulatedWorld
@@ -73,7 +73,7 @@ def rig_before_board() -> Rig:
 def taken(name: str) -> tuple[PatternSequence, np.ndarray]:
     rig, sequence = rig_before_board(), SEQUENCES[name]()
     with rig.opened():
-        frames = np.array(capture(rig, sequence))
+        frames = np.array(capture_frames(rig, sequence))
     frames.setflags(write=False)
     return sequence, frames
 

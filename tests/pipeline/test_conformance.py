@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from facts import missing_facts
 
-from slviewer.devices.opening import Openable
-from slviewer.devices.protocols import CameraSettings, check_frame
+from slviewer.devices.protocols import CameraSettings, Openable, check_frame
 from slviewer.devices.simulated import SimulatedTurntable, simulated_rig
 from slviewer.devices.world import SimulatedWorld
 from slviewer.fringe.patterns import render_pattern

@@ -11,7 +11,7 @@ import pytest
 from facts import missing_facts
 from sound_checks import save_sound_checks
 
-from slviewer.devices.capture import capture
+from slviewer.devices.capture import capture_frames
 from slviewer.devices.simulated import simulated_rig
 from slviewer.devices.world import SimulatedWorld
 from slviewer.fringe.phase import Reason
@@ -35,7 +35,7 @@ def captured(sequence_of: Callable) -> Captured:
     rig = simulated_rig(world)
     sequence = sequence_of(rig.projector.size)
     with rig.opened():
-        return sequence, capture(rig, sequence)
+        return sequence, capture_frames(rig, sequence)
 
 
 @pytest.fixture(scope="module")

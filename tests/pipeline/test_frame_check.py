@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from facts import missing_facts
 
-from slviewer.devices.capture import capture
+from slviewer.devices.capture import capture_frames
 from slviewer.devices.simulated import simulated_rig
 from slviewer.devices.world import SimulatedWorld
 from slviewer.fringe.presets import complementary, gray, multifrequency, p18
@@ -31,7 +31,7 @@ def captured(sequence_of, *scene):
     rig = placed_rig(*scene)
     sequence = sequence_of(rig.projector.size)
     with rig.opened():
-        return sequence, capture(rig, sequence)
+        return sequence, capture_frames(rig, sequence)
 
 
 def captured_again(index):

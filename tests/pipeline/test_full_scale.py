@@ -27,7 +27,7 @@ from slviewer.pipeline.capture_phases import capture_texture, loss_warnings
 from slviewer.pipeline.exposure_check import check_capture_exposure
 from slviewer.pipeline.import_captures import import_captures
 from slviewer.pipeline.rig_choice import RigSetup
-from slviewer.preflight.check_rig import check_capture, preflight
+from slviewer.preflight.check_rig import check_recorded_rig, preflight
 from slviewer.session.importers.images import read_frames
 from slviewer.session.store import Session
 from slviewer.simulation.rig import letter
@@ -85,7 +85,7 @@ def test_a_dark_capture_is_dark_everywhere(tmp_path: Path) -> None:
         assert 5 < shown.max() < 15 and capture_texture(shot, frames).max() == 255
         assert cv2.imdecode(np.frombuffer(thumbnail(shot), np.uint8), 0).max() < 20
         assert stated_full_scale(replay(frames, shot.sequence).camera) == 4095
-    exposure = check_capture(folder, "a").check("exposure")
+    exposure = check_recorded_rig(folder, "a").check("exposure")
     assert exposure.verdict == "bad" and 0.03 < exposure.figures["bright_share_of_full_scale"] < 0.05
     lit = frames[np.argmax(frames.mean(axis=(1, 2)))]
     assert brightness(lit, 4095)[1] < 0.05 < DIM < brightness(lit)[1]
@@ -123,7 +123,7 @@ def test_pixels_at_the_full_scale_are_saturated(tmp_path: Path, full_scale: int)
     assert 0.05 < clipped < 0.9
     np.testing.assert_array_equal(decode_reference(sequence, frames, "x").reason == Reason.SATURATED, phase.reason == 2)
     assert any("saturated" in message for message in loss_warnings(sequence, frames, {"x": phase}))
-    assert check_capture(folder, "a").check("exposure").figures["saturated_share"] > 0.05
+    assert check_recorded_rig(folder, "a").check("exposure").figures["saturated_share"] > 0.05
     unstated = (decode(replace(sequence, full_scale=None), frames, "x").reason == Reason.SATURATED).mean()
     assert unstated == (clipped if full_scale == 4095 else 0)
 

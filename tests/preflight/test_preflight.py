@@ -19,7 +19,7 @@ from slviewer.errors import Cancelled
 from slviewer.pipeline.check_results import Preflight
 from slviewer.pipeline.rig_choice import set_up
 from slviewer.preflight.check_rig import check_rig, preflight
-from slviewer.preflight.turntable import check_turntable
+from slviewer.preflight.turntable import check_turning
 from slviewer.simulation.boards import Pose
 from slviewer.simulation.rig import letter
 
@@ -96,7 +96,7 @@ def test_a_turntable_is_checked_too(looked):
     assert abs(scene.table_deg) < 0.2 and scene.standing == "board"
     lame = SimulatedTurntable(scene)
     lame.open()
-    broken = check_turntable(lame)
+    broken = check_turning(lame)
     assert broken.verdict == "bad" and not missing_facts(broken.remedy, "close")
 
 

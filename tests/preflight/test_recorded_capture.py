@@ -10,13 +10,13 @@ import pytest
 from imperfect_rig import Imperfections, imperfect
 
 from slviewer.cli import main
-from slviewer.devices.capture import capture
+from slviewer.devices.capture import capture_frames
 from slviewer.devices.simulated import simulated_rig
 from slviewer.devices.world import SimulatedWorld
 from slviewer.fringe.presets import complementary, gray, p18
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.pipeline.check_results import Preflight
-from slviewer.preflight.check_rig import check_capture
+from slviewer.preflight.check_rig import check_recorded_rig
 from slviewer.session.store import Session
 from slviewer.simulation.rig import letter
 
@@ -34,7 +34,7 @@ def frames_of(
     rig, _ = imperfect(simulated_rig(world), Imperfections(**wrong))
     sequence = sequence_of(rig.projector.size)
     with rig.opened():
-        stack = capture(rig, sequence)
+        stack = capture_frames(rig, sequence)
     stack.flags.writeable = False  # tests share it
     return sequence, stack
 
@@ -42,7 +42,7 @@ def frames_of(
 def checked(folder: Path, sequence: PatternSequence, stack: np.ndarray) -> Preflight:
     with Session.create(folder) as store:
         store.save_capture("part", "scan", sequence, stack, source="a test")
-    return check_capture(folder, "part")
+    return check_recorded_rig(folder, "part")
 
 
 def gained(stack: np.ndarray, gain: float | np.ndarray, offset: float = 0.0) -> np.ndarray:

@@ -20,7 +20,7 @@ from slviewer.server.auth_middleware import DevicePage
 from slviewer.server.connection import CHUNK
 from slviewer.server.limits import CONNECTIONS
 from slviewer.server.secure import Serving, serve
-from slviewer.server.text import escape, safe_name
+from slviewer.server.text import escape, safe_file_name
 
 PAGE = "<!doctype html><title>projector</title><script>let a = 1</script>"
 
@@ -211,12 +211,12 @@ def test_ordinary_names_stay_readable():
     ],
 )
 def test_uploaded_names_are_plain_file_names(name, safe):
-    assert safe_name(name) == safe
+    assert safe_file_name(name) == safe
 
 
 def test_long_names_are_cut_and_keep_their_suffix():
-    name = safe_name("漢" * 300 + ".ply")
-    assert name.endswith(".ply") and len(name.encode()) <= 200 and len(safe_name("a." + "b" * 500)) <= 120
+    name = safe_file_name("漢" * 300 + ".ply")
+    assert name.endswith(".ply") and len(name.encode()) <= 200 and len(safe_file_name("a." + "b" * 500)) <= 120
 
 
 def test_the_server_stops_and_its_port_is_free_again(serving):

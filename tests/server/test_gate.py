@@ -325,7 +325,7 @@ def example(kind: type) -> dict:
 @pytest.mark.parametrize("role", ROLES)
 def test_every_message_of_the_protocol_for_every_role(server, operator, role, monkeypatch):
     client = operator.client()  # whatever the role, the gate is that of a connected client
-    connection = viser_internals.connection_of(server.viser, client.number)
+    connection = viser_internals.ViserClient(server.viser, client.number).connection
     gate = ViserGate(server.viser, connection, role, UploadBudget(1000))
     considered = set()
     monkeypatch.setattr(gate, "_check_message", partial(note_considered, gate._check_message, considered))
@@ -365,7 +365,7 @@ def test_what_an_operator_types_into_a_private_input_reaches_no_watcher(server, 
     assert until(lambda: address.value == secret)
     watching.set(address, "x")  # is refused, and answered with the true value where it is no secret
     settle(typing)
-    viser_internals.send_private_values(server.viser, other.number)
+    viser_internals.ViserClient(server.viser, other.number).send_private_values()
     assert until(lambda: other.told(address) == [secret])
     late = watcher.client()
     settle(typing)

@@ -13,18 +13,18 @@ from playwright.sync_api import Browser
 
 from slviewer.errors import SlviewerError, UsageError
 from slviewer.server import credentials
-from slviewer.server.credentials import Certificate, self_made_certificate
+from slviewer.server.credentials import TlsCertificate, self_made_certificate
 from slviewer.server.limits import STRANGERS_PER_ADDRESS
 from slviewer.server.secure import SafeServer, Serving, serve
 
 
 @pytest.fixture(scope="module")
-def certificate(tmp_path_factory: pytest.TempPathFactory) -> Certificate:
+def certificate(tmp_path_factory: pytest.TempPathFactory) -> TlsCertificate:
     return self_made_certificate("127.0.0.1", ("scanner.lab",), tmp_path_factory.mktemp("config"))
 
 
 @pytest.fixture
-def served(certificate: Certificate, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch):
+def served(certificate: TlsCertificate, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch):
     """A server with this certificate: as the user's own, else as the one that slviewer made."""
     own = getattr(request, "param", False)
     monkeypatch.setattr(credentials, "_config_folder", lambda: certificate.chain.parent)
@@ -34,7 +34,7 @@ def served(certificate: Certificate, request: pytest.FixtureRequest, monkeypatch
     server.stop()
 
 
-def ask(server: SafeServer, certificate: Certificate, path: str, **headers: str) -> http.client.HTTPResponse:
+def ask(server: SafeServer, certificate: TlsCertificate, path: str, **headers: str) -> http.client.HTTPResponse:
     context = ssl.create_default_context(cafile=str(certificate.chain))
     connection = http.client.HTTPSConnection("127.0.0.1", server.port, timeout=HANG_S, context=context)
     connection.request("GET", path, headers=headers)

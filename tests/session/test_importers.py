@@ -250,13 +250,13 @@ def write_frames(folder: Path, top="", bottom="", edit=lambda text: text) -> Pat
 def test_frames_are_what_the_toml_says(tmp_path):
     toml = write_frames(tmp_path, "phase_sign = -1\ngray_origin = 0.0")
     write(tmp_path / "capture/more.png", image(9))
-    found = frames_layout.read(tmp_path, toml, prefix="p")
+    found = frames_layout.LAYOUT.read(tmp_path, toml, prefix="p")
     (capture,) = found
     assert capture.name == "p_capture" and "more.png" in found.warnings[0]
     assert (capture.sequence.phase_sign, capture.sequence.gray_origin_px) == (-1, 0.0)
     assert capture.settings == {"gray_origin_given": True}
     np.testing.assert_array_equal(capture.frames, [image(seed) for seed in range(4)])
-    (alone,) = frames_layout.read(tmp_path / "capture", write_frames(tmp_path))
+    (alone,) = frames_layout.LAYOUT.read(tmp_path / "capture", write_frames(tmp_path))
     assert alone.name == "capture" and alone.settings == {"gray_origin_given": False}
 
 
@@ -288,19 +288,19 @@ def test_frames_are_what_the_toml_says(tmp_path):
 def test_frames_toml_faults_are_named(tmp_path, edit, facts):
     toml = write_frames(tmp_path, edit=edit)
     with raises(InputError, *facts):
-        frames_layout.read(tmp_path, toml)
+        frames_layout.LAYOUT.read(tmp_path, toml)
 
 
 def test_frames_projector_given_beside_the_toml(tmp_path):
     toml = write_frames(tmp_path, edit=lambda text: text.replace('projector = "96x64"', ""))
-    assert frames_layout.read(tmp_path, toml, projector=(96, 64)).recordings[0].sequence.projector == (96, 64)
-    assert frames_layout.read(tmp_path, toml).recordings[0].sequence.projector_size is None
+    assert frames_layout.LAYOUT.read(tmp_path, toml, projector=(96, 64)).recordings[0].sequence.projector == (96, 64)
+    assert frames_layout.LAYOUT.read(tmp_path, toml).recordings[0].sequence.projector_size is None
     toml = write_frames(tmp_path)
-    frames_layout.read(tmp_path, toml, projector=(96, 64))
+    frames_layout.LAYOUT.read(tmp_path, toml, projector=(96, 64))
     with raises(InputError, "96x64", "912x1140"):
-        frames_layout.read(tmp_path, toml, projector=(912, 1140))
+        frames_layout.LAYOUT.read(tmp_path, toml, projector=(912, 1140))
     with pytest.raises(InputError):
-        frames_layout.read(tmp_path, tmp_path / "absent.toml")
+        frames_layout.LAYOUT.read(tmp_path, tmp_path / "absent.toml")
 
 
 GROUPS = """
@@ -335,7 +335,7 @@ def write_groups(folder: Path, names: list[str], toml: str) -> Path:
 def test_groups_take_their_files_by_pattern_in_natural_order(tmp_path):
     toml = write_groups(tmp_path, [*GROUP_FILES, "white.png"], GROUPS.format(top=""))
     write(tmp_path / "capture" / "t1_0001.png", image(99))  # no bracket: the pattern's are literal
-    found = frames_layout.read(tmp_path, toml)
+    found = frames_layout.LAYOUT.read(tmp_path, toml)
     (capture,) = found
     np.testing.assert_array_equal(capture.frames, [image(seed) for seed in range(11)])
     assert "t1_0001.png" in found.warnings[0]
@@ -350,7 +350,7 @@ def test_groups_take_their_files_by_pattern_in_natural_order(tmp_path):
     ]  # fmt: skip
     (tmp_path / "capture" / "fringe_8.png").unlink()
     with raises(InputError, "5 files", '"fringe_*.png"', "[[frames]] 1", "phase x", "6 images"):
-        frames_layout.read(tmp_path, toml)
+        frames_layout.LAYOUT.read(tmp_path, toml)
 
 
 def test_groups_in_order_of_the_names(tmp_path):
@@ -358,11 +358,11 @@ def test_groups_in_order_of_the_names(tmp_path):
         line for line in GROUPS.format(top='order = "name"').splitlines() if not line.startswith("files")
     )
     toml = write_groups(tmp_path, [f"{n}.bmp" for n in range(11)], ordered)
-    (capture,) = frames_layout.read(tmp_path, toml)
+    (capture,) = frames_layout.LAYOUT.read(tmp_path, toml)
     np.testing.assert_array_equal(capture.frames, [image(seed) for seed in range(11)])
     write(tmp_path / "capture" / "preview.png", image(0))
     with raises(InputError, "12 images", 11):
-        frames_layout.read(tmp_path, toml)
+        frames_layout.LAYOUT.read(tmp_path, toml)
 
 
 @pytest.mark.parametrize(
@@ -398,7 +398,7 @@ def test_gray_groups(tmp_path, text, kinds):
 def test_faults_in_groups_are_named(tmp_path, old, new, facts):
     toml = write_groups(tmp_path, [*GROUP_FILES, "white.png"], GROUPS.format(top="").replace(old, new))
     with raises(InputError, *facts):
-        frames_layout.read(tmp_path, toml)
+        frames_layout.LAYOUT.read(tmp_path, toml)
 
 
 def test_brackets_of_exposures_become_one_capture(tmp_path):
@@ -408,16 +408,16 @@ def test_brackets_of_exposures_become_one_capture(tmp_path):
         for exposure in (20, 5)
     )
     names = [f"{exposure}ms/{n}.png" for exposure in (20, 5) for n in range(3)]
-    (capture,) = frames_layout.read(tmp_path, write_groups(tmp_path, names, text))
+    (capture,) = frames_layout.LAYOUT.read(tmp_path, write_groups(tmp_path, names, text))
     assert capture.exposures_ms == (20.0, 5.0) and len(capture.sequence.frames) == 3
     np.testing.assert_array_equal(capture.frames, [image(seed) for seed in range(6)])
     longest = capture.frames[:3].max(0) < 255
     np.testing.assert_array_equal(capture.merged_frames(), np.where(longest, capture.frames[:3], capture.frames[3:]))
     (tmp_path / "sequence.toml").write_text(text.replace("steps = 3", "steps = 4", 1))
     with raises(InputError, 20, "5 ms"):
-        frames_layout.read(tmp_path, tmp_path / "sequence.toml")
+        frames_layout.LAYOUT.read(tmp_path, tmp_path / "sequence.toml")
     (tmp_path / "sequence.toml").write_text(text[: text.rindex("[[")])
-    (capture,) = frames_layout.read(tmp_path, tmp_path / "sequence.toml")
+    (capture,) = frames_layout.LAYOUT.read(tmp_path, tmp_path / "sequence.toml")
     assert capture.exposures_ms == () and capture.settings["exposure_ms"] == 20.0
 
 
@@ -441,7 +441,7 @@ files = ["4.png", "5.png", "6.png", "7.png", "8.png", "9.png"]
 def test_frames_of_a_real_scene(real_data, tmp_path):
     toml = tmp_path / "david.toml"
     toml.write_text(DAVID)
-    (capture,) = frames_layout.read(real_data / "slmaster_david" / "L", toml)
+    (capture,) = frames_layout.LAYOUT.read(real_data / "slmaster_david" / "L", toml)
     assert capture.name == "L" and capture.frames.shape == (10, 1536, 2048)
     assert capture.sequence.projector_size is None and capture.sequence.frames[9] == Frame("complementary", "x")
     a, b, c, d = capture.frames[:4, ::8, ::8].astype(float)

@@ -107,19 +107,19 @@ def test_opencv_generates_columns_then_rows_each_with_its_inverse(tmp_path, shad
     for number, pattern in enumerate(patterns, 1):
         write(tmp_path / "scan" / f"pattern_cam1_im{number}.png", pattern)
     assert layouts.detect_layout(tmp_path) == "opencv-graycode"
-    (capture,) = opencv_graycode.read(tmp_path, projector=SIZE)
+    (capture,) = opencv_graycode.LAYOUT.read(tmp_path, projector=SIZE)
     for axis in ("x", "y"):
         assert np.abs(decoded_error(capture, axis)).max() < 0.5
     write(tmp_path / "scan" / "pattern_cam2_im1.png", U / COLUMNS)
     with raises(InputError, "pattern_cam1_imN", "pattern_cam2_imN", '--files "pattern_cam1_im'):
-        opencv_graycode.read(tmp_path, projector=SIZE)
-    found = opencv_graycode.read(tmp_path, projector=SIZE, files="pattern_cam1_*")
+        opencv_graycode.LAYOUT.read(tmp_path, projector=SIZE)
+    found = opencv_graycode.LAYOUT.read(tmp_path, projector=SIZE, files="pattern_cam1_*")
     assert len(found) == 1 and "pattern_cam2_im1.png" in found.warnings[0]
     other = (2000, ROWS) if shadow else (COLUMNS, 60)  # as many images as another projector without, or with them
     with pytest.raises(InputError):
-        opencv_graycode.read(tmp_path, projector=other, files="pattern_cam1_*")
+        opencv_graycode.LAYOUT.read(tmp_path, projector=other, files="pattern_cam1_*")
     with raises(InputError, f"{len(patterns)} images", "4000x120", 40):
-        opencv_graycode.read(tmp_path, projector=(4000, ROWS), files="pattern_cam1_*")
+        opencv_graycode.LAYOUT.read(tmp_path, projector=(4000, ROWS), files="pattern_cam1_*")
 
 
 @pytest.mark.computes

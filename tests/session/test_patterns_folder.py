@@ -17,7 +17,7 @@ PROJECTOR = (120, 90)
 def test_a_camera_that_sees_the_patterns_themselves_decodes_its_own_pixels(tmp_path, preset):
     sequence = PRESETS[preset](PROJECTOR)
     write_pattern_folder(tmp_path / "patterns", sequence)
-    (capture,) = frames_layout.read(tmp_path / "patterns", tmp_path / "patterns" / "sequence.toml")
+    (capture,) = frames_layout.LAYOUT.read(tmp_path / "patterns", tmp_path / "patterns" / "sequence.toml")
     assert capture.sequence == sequence and capture.settings == {"gray_origin_given": True}
     truth = {"x": np.arange(120.0)[None, :], "y": np.arange(90.0)[:, None]}
     for axis in sequence.axes:

@@ -37,7 +37,7 @@ from slviewer.session.reading import read_toml
 from slviewer.session.stack import describe_stack
 from slviewer.session.store import Session
 from slviewer.session.toml import format_value
-from slviewer.simulation.assets import asset_folder
+from slviewer.simulation.assets import asset
 
 settings.register_profile(
     "readers",
@@ -195,7 +195,7 @@ def test_a_stack_is_never_larger_than_its_files(full: Session, data: Any) -> Non
 def _asset(name: str) -> dict[str, Any]:
     """Return the tables of a TOML file that comes with the program."""
     kind, _, file = name.partition("/")
-    return read_toml(asset_folder(kind) / file)
+    return read_toml(asset(kind) / file)
 
 
 _FRAMES = [frame.to_dict() | {"file": f"{i}.png"} for i, frame in enumerate(phase_steps("x", 3, 96.0))]

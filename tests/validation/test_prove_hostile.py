@@ -9,7 +9,7 @@ from facts import raises
 from slviewer.errors import InputError, UsageError
 from slviewer.simulation.hostile import FAULTS
 from slviewer.validation.hostile_captures import CaseReport, MeasuredScan
-from slviewer.validation.prove_hostile import Figures, choose_cases, fit_gauge, judge, prove_hostile, score
+from slviewer.validation.prove_hostile import Figures, choose_cases, fit_gauge, judge_case, prove_hostile, score
 
 FLOOR = Figures(0.06, 0.06, 0.003, 0.99)
 GOOD = Figures(0.07, 0.06, 0.004, 0.98)
@@ -20,7 +20,7 @@ RIGHT, OTHER = frozenset({"flicker"}), frozenset({"projector-size"})
 
 
 def outcome(figures, *named, severity="medium", error=None):
-    return judge(FAULTS["flicker"], severity, CaseReport([], list(named), error), figures, FLOOR)[0]
+    return judge_case(FAULTS["flicker"], severity, CaseReport([], list(named), error), figures, FLOOR)[0]
 
 
 def test_cases_are_judged_by_errors_and_by_what_was_said():

@@ -15,8 +15,8 @@ from slviewer.calibration.splined.posterior import compute_point_jacobian
 from slviewer.calibration.splined.residual_noise import Noise
 from slviewer.calibration.splined.unknowns import Arrangement, State
 from slviewer.fringe.sequence import Axis
-from slviewer.records.plain import from_plain, to_plain
 from slviewer.geometry.rigid import Floats
+from slviewer.records.plain import from_plain, to_plain
 
 _STATE_ARRAYS = ("R_board", "t_board", "heights", "offsets")
 _OWN_ARRAYS = ("points", "camera_poses", "projector_poses")

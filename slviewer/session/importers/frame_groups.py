@@ -78,25 +78,17 @@ class _Inverse(_Group, tag="inverse"):
 class _Complementary(_Group, tag="complementary"):
     """Group of the complementary Gray code image."""
 
-    pass
-
 
 class _White(_Group, tag="white"):
     """Group of the white image."""
-
-    pass
 
 
 class _Black(_Group, tag="black"):
     """Group of the black image."""
 
-    pass
-
 
 class _Texture(_Group, tag="texture"):
     """The image of the scene's texture."""
-
-    pass
 
 
 _AnyGroup = _Phase | _Gray | _Inverse | _Complementary | _White | _Black | _Texture

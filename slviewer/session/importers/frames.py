@@ -68,6 +68,7 @@ from slviewer.fringe.sequence import SEQUENCE_KEYS, PatternSequence, parse_size
 from slviewer.session.importers.frame_groups import FrameGroup, has_wildcard, images_by_name, read_groups
 from slviewer.session.importers.images import Channel
 from slviewer.session.importers.imported import (
+    FolderLayout,
     ImportableRecording,
     Imports,
     collect_captures,
@@ -135,7 +136,7 @@ class Description:
         return 2 * sum(len(group.select(folder)) for group in self.groups) > len(self.files_order)
 
 
-def read(source: Path, toml: Path, *, prefix: str | None = None, projector: tuple[int, int] | None = None) -> Imports:
+def _read(source: Path, toml: Path, *, prefix: str | None = None, projector: tuple[int, int] | None = None) -> Imports:
     """Captures named after their folders, all described by the one TOML.
 
     `projector` is for a TOML that does not say the size. A capture's settings say under `gray_origin_given` whether
@@ -211,3 +212,6 @@ def _check_projector(toml: Path, data: Mapping[str, Any], projector: tuple[int, 
             f"{toml.name} says that the projector is {data['projector']}, and {projector[0]}x{projector[1]} was given: "
             "correct the one that is wrong"
         )
+
+
+LAYOUT = FolderLayout("frames", "images and a TOML that describes them", _read, lambda folder: False)

@@ -21,7 +21,7 @@ class GuessedDescription:
     doubts: tuple[str, ...]
 
 
-def guess_description(
+def guess_toml(
     folder: Path, projector: tuple[int, int] | None = None, channel: Channel | None = None
 ) -> GuessedDescription:
     """Guess the pattern sequence of a folder's images, in natural order of their names, as a TOML with doubts.

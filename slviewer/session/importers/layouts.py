@@ -9,15 +9,7 @@ from slviewer.session.importers.imported import FolderLayout, visible
 from slviewer.session.reading import expand_user
 
 BUILT_IN = {
-    layout.name: layout
-    for layout in (
-        p18.LAYOUT,
-        procam_calibration.LAYOUT,
-        slstudio.LAYOUT,
-        sltk.LAYOUT,
-        FolderLayout("opencv-graycode", "pattern_camN_imN images", opencv_graycode.read, opencv_graycode.is_capture),
-        FolderLayout("frames", "images and a TOML that describes them", frames.read, lambda folder: False),
-    )
+    module.LAYOUT.name: module.LAYOUT for module in (p18, procam_calibration, slstudio, sltk, opencv_graycode, frames)
 }
 LAYOUT_PLUGINS = PluginGroup(IMPORTERS, FolderLayout, lambda: BUILT_IN)
 

@@ -16,6 +16,7 @@ from slviewer.fringe.sequence import PatternSequence
 from slviewer.session.importers.frame_groups import images_by_name, match_files
 from slviewer.session.importers.images import read_frames
 from slviewer.session.importers.imported import (
+    FolderLayout,
     ImportableRecording,
     Imports,
     collect_captures,
@@ -30,7 +31,7 @@ all of them but for a few that something disturbs, and half of them between two 
 _SAMPLE = re.compile(r"pattern_(cam\d+_)?(im)?\d+", re.IGNORECASE)
 
 
-def read(
+def _read(
     source: Path,
     *,
     prefix: str | None = None,
@@ -70,11 +71,6 @@ def read(
     )
 
 
-def is_capture(folder: Path) -> bool:
-    """Whether a folder holds images with the names of OpenCV's own program."""
-    return has_images(folder, _SAMPLE)
-
-
 def _check_shadow_images(files: list[Path], sequence: PatternSequence) -> None:
     """Raise InputError where white and black images are in place of stripes, or the other way round.
 
@@ -107,3 +103,6 @@ def _fit_sequence(sequence: PatternSequence, images: int) -> PatternSequence:
         f"it holds {images} images, and the Gray code of a {width}x{height} projector takes {needed}, or {needed - 2} "
         "without white and black: images are missing or too many, or the projector has another size"
     )
+
+
+LAYOUT = FolderLayout("opencv-graycode", "pattern_camN_imN images", _read, lambda folder: has_images(folder, _SAMPLE))

@@ -29,7 +29,7 @@ _AXES: dict[str, Axis] = {"v": "x", "h": "y"}
 _FILE = re.compile(r"p18_f(\d+)", re.IGNORECASE)
 
 
-def describe(pose: Path, name: str, projector: tuple[int, int]) -> tuple[ImportableRecording, list[str]]:
+def _describe(pose: Path, name: str, projector: tuple[int, int]) -> tuple[ImportableRecording, list[str]]:
     """The recording of one folder, with the axes whose folder is there, V before H.
 
     Raises InputError where frames are missing, double or too many, or where the Gray code cannot number the projector's
@@ -87,4 +87,4 @@ def _is_capture(folder: Path) -> bool:
     )
 
 
-LAYOUT = define_layout("p18", "pose_XX/{V,H}/P18_FNN images", describe, _is_capture, (912, 1140))
+LAYOUT = define_layout("p18", "pose_XX/{V,H}/P18_FNN images", _describe, _is_capture, (912, 1140))

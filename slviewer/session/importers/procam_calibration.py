@@ -21,7 +21,7 @@ from slviewer.session.importers.imported import (
 _FILE = re.compile(r"graycode_?(\d+)", re.IGNORECASE)
 
 
-def describe(folder: Path, name: str, projector: tuple[int, int]) -> tuple[ImportableRecording, list[str]]:
+def _describe(folder: Path, name: str, projector: tuple[int, int]) -> tuple[ImportableRecording, list[str]]:
     """Return the recording of one folder. The projector's size determines the numbers of bits and of images."""
     images, others = match_images(folder, _FILE)
     sequence = gray(projector)
@@ -38,7 +38,7 @@ def describe(folder: Path, name: str, projector: tuple[int, int]) -> tuple[Impor
 LAYOUT = define_layout(
     "procam-calibration",
     "capture_N/graycode_NN images",
-    describe,
+    _describe,
     lambda folder: has_images(folder, _FILE),
     (1024, 768),
 )

@@ -45,7 +45,7 @@ _SHOWN_BITS: dict[Axis, int] = {"x": 10, "y": 6}
 _SINGLE_AXIS: tuple[Codec, ...] = ("3", "4")
 
 
-def describe(
+def _describe(
     folder: Path, name: str, projector: tuple[int, int], codec: Codec | None = None, axis: Axis = "x"
 ) -> tuple[ImportableRecording, list[str]]:
     """The recording of one folder. Without ``codec`` the number of frames determines it, where that is enough; ``axis``
@@ -109,7 +109,7 @@ def _gray_cell(axis: Axis, projector: tuple[int, int]) -> float:
 LAYOUT = define_layout(
     "slstudio",
     "frameSeq_NN images",
-    describe,
+    _describe,
     lambda folder: has_images(folder, _FILE),
     needs_projector="the fringes of SLStudio",
 )

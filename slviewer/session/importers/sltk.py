@@ -20,7 +20,7 @@ from slviewer.session.importers.imported import (
 _FILE = re.compile(r".*\[(0?[01])-(\d+)-(0?[01])_(\d+)\].*")
 
 
-def describe(folder: Path, name: str, projector: tuple[int, int] | None) -> tuple[ImportableRecording, list[str]]:
+def _describe(folder: Path, name: str, projector: tuple[int, int] | None) -> tuple[ImportableRecording, list[str]]:
     """The recording of one folder. Raises InputError where a bit or its negative is missing or double."""
     images, others = match_images(folder, _FILE)
     ordered = sorted(images, key=lambda numbers: numbers[3])
@@ -34,4 +34,4 @@ def describe(folder: Path, name: str, projector: tuple[int, int] | None) -> tupl
     return ImportableRecording(name, sequence, files, folder), strangers_warning(folder, others)
 
 
-LAYOUT = define_layout("sltk", "TIME_[AA-BB-CC_NN]_img images", describe, lambda folder: has_images(folder, _FILE))
+LAYOUT = define_layout("sltk", "TIME_[AA-BB-CC_NN]_img images", _describe, lambda folder: has_images(folder, _FILE))
