@@ -53,6 +53,10 @@ FORBIDDEN = [
 NUMERIC = PACKAGES[1 : PACKAGES.index("simulation")]
 SOURCES = sorted(set((ROOT / "slviewer").rglob("*.py")) - {ROOT / "slviewer/_version.py"})  # a build writes that
 MOST_LINES = 500
+MANY_BRANCHES, MANY_PARAMETERS = 15, 8
+MOST_WITH_MANY_BRANCHES, MOST_WITH_MANY_PARAMETERS = 20, 22
+"""Functions that are allowed more; lower these where some are simplified."""
+DECISIONS = (ast.If, ast.For, ast.While, ast.IfExp, ast.ExceptHandler, ast.comprehension, ast.Assert, ast.match_case)
 MOST_SHARE = 0.15
 """Of the code in one package; a larger one holds more than one idea."""
 
@@ -136,6 +140,38 @@ def test_numeric_packages_know_no_device_and_no_browser() -> None:
 def test_files_can_be_read_in_one_sitting() -> None:
     long = {str(p.relative_to(ROOT)): n for p in SOURCES if (n := len(p.read_text().splitlines())) > MOST_LINES}
     assert not long
+
+
+def count_branches(function: ast.AST) -> int:
+    """Decisions in a function, without those of functions inside it."""
+    inside = [n for n in ast.walk(function) if isinstance(n, ast.FunctionDef | ast.Lambda) and n is not function]
+    hidden = {id(node) for each in inside for node in ast.walk(each)}
+    own = [node for node in ast.walk(function) if id(node) not in hidden]
+    chained = sum(len(node.values) - 1 for node in own if isinstance(node, ast.BoolOp))
+    return chained + sum(isinstance(node, DECISIONS) for node in own)
+
+
+def is_kernel(function: ast.FunctionDef) -> bool:
+    """Whether numba compiles a function: it has no objects for arguments."""
+    names = "".join(map(ast.unparse, function.decorator_list))
+    return "jit" in names or "kernel" in names
+
+
+def test_functions_can_be_followed() -> None:
+    """Few have many branches or parameters, and none more than before."""
+    branches, parameters = [], []
+    for path in SOURCES:
+        for node in ast.walk(ast.parse(path.read_text())):
+            if not isinstance(node, ast.FunctionDef):
+                continue
+            place, given = f"{path.relative_to(ROOT)}: {node.name}", node.args
+            if count_branches(node) > MANY_BRANCHES:
+                branches.append(place)
+            count = len(given.args) + len(given.kwonlyargs) + len(given.posonlyargs)
+            if count > MANY_PARAMETERS and not is_kernel(node):
+                parameters.append(place)
+    assert len(branches) <= MOST_WITH_MANY_BRANCHES, branches
+    assert len(parameters) <= MOST_WITH_MANY_PARAMETERS, parameters
 
 
 def test_test_modules_have_names_of_their_own() -> None:

@@ -16,12 +16,13 @@ from slviewer.evaluation.budget import Contribution, ErrorBudget
 from slviewer.evaluation.repeatability import Repeatability, repeatability
 from slviewer.pipeline.capture_clouds import capture_cloud, check_capture_sizes
 from slviewer.pipeline.capture_phases import capture_texture, decode_captures
-from slviewer.pipeline.check import DriftRecord, load_drift_history
+from slviewer.pipeline.check import load_drift_history
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings, part
 from slviewer.pipeline.models import ModelName, best_model, check_accepted, load_model, load_stereo, warn_if_stale
 from slviewer.pipeline.open_session import SessionLike, match_names, next_number, opened
 from slviewer.pipeline.reconstruct import segment_board
 from slviewer.pipeline.scale import record_scale, scale_factor
+from slviewer.records.drift import Drift
 from slviewer.session.reading import read_toml
 from slviewer.session.store import Session
 
@@ -120,8 +121,7 @@ def accept(
                     yield cloud.points[..., 2], cloud.sigma_z
 
             repeatability_mm = repeatability(clouds())
-        calibration = store.input_hashes("calibration/stereo")["calibration/stereo"]
-        checks = [checked for checked in load_drift_history(store) if checked.calibration == calibration]
+        checks = load_drift_history(store)
         applied = record_scale(store, test) if apply_scale else None
         result = AcceptanceResult(test, factor, applied, _length_budget(test, applied, checks), repeatability_mm)
         meta = {
@@ -152,7 +152,7 @@ def _match_captures(store: Session, artefact: Artefact) -> dict[str, str]:
     return positions
 
 
-def _length_budget(test: Acceptance, applied: float | None, checks: Sequence[DriftRecord]) -> ErrorBudget | None:
+def _length_budget(test: Acceptance, applied: float | None, checks: Sequence[Drift]) -> ErrorBudget | None:
     """Error budget of the artefact's length from the test and the drift checks; None where no length was measured."""
     scale = test.scale
     if scale is None:
@@ -167,7 +167,7 @@ def _length_budget(test: Acceptance, applied: float | None, checks: Sequence[Dri
     warmth = mm * 1e-6 * artefact.expansion.ppm_per_kelvin * artefact.temperature.U_kelvin / 2
     drift, since = None, "no drift check of this calibration: run `slviewer check`"
     if checks:
-        last = checks[-1].drift
+        last = checks[-1]
         drift = mm * 1e-6 * float(np.hypot(last.scale_ppm, last.scale_sigma_ppm))
         since = f"the drift check of {last.capture}"
     return ErrorBudget(

@@ -363,8 +363,8 @@ def _run_again(
         with _note_failure(why, *results):
             found = list(operation.find(Job(fresh), operation.settings(**msgspec.json.decode(settings))))
             made = {f"{each.record.kind}/{each.name}": each.record.figures() for each in found}
-            numbered = len(results) == len(found) == 1  # its number here may be another
-            figures |= dict(zip(results, made.values(), strict=True)) if numbered else made
+            is_numbered = len(found) == 1 and found[0].name.isdecimal()  # its number here may be another
+            figures |= dict.fromkeys(results, found[0].record.figures()) if is_numbered else made
     return figures
 
 

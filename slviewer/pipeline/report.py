@@ -16,7 +16,6 @@ from slviewer.errors import InputError
 from slviewer.fringe.sequence import Axis
 from slviewer.pipeline.calibration_verdict import load_last_verdict
 from slviewer.pipeline.certificate import certificate_section, certify_page, make_certificate
-from slviewer.pipeline.check import load_drift_history
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
 from slviewer.pipeline.measurements import load_measurements, section_lines
 from slviewer.pipeline.models import (
@@ -40,7 +39,6 @@ from slviewer.report.data import (
     AcceptanceView,
     CalibrationFigures,
     CaptureRow,
-    DriftRow,
     ModelsView,
     PixelCurve,
     PixelFitView,
@@ -118,7 +116,6 @@ def _collect_data(store: Session) -> SessionData:
         verdict_of_calibration=verdict is not None and judged is not None and from_plain(judged, Verdict) == verdict,
         models=_load_models(store),
         acceptances=_list_acceptances(store),
-        drifts=_list_drifts(store),
         region="" if region is None else region.text(),
         edits=[(scan, words) for scan in store.capture_names("scan") for words in list_edits(store, scan)[0]],
         **measured_views(store),
@@ -150,22 +147,14 @@ def _list_acceptances(store: Session) -> list[AcceptanceView]:
     return views
 
 
-def _list_drifts(store: Session) -> list[DriftRow]:
-    """Return the drift checks as rows, each with whether it is of the present calibration."""
-    if "stereo" not in available_models(store):
-        return []
-    now = store.input_hashes("calibration/stereo")["calibration/stereo"]
-    return [DriftRow(each.drift, each.time, each.calibration == now) for each in load_drift_history(store)]
-
-
 def _collect_records(store: Session) -> tuple[list[RecordsView], list[str]]:
     """Return the records made from what the session holds now, by kind, with pictures of the first ones; and warnings
     of the others."""
     views, stale = [], []
     for kind in RECORDS.values():
         every = list_records(store, kind)
-        fresh = [each for each in every if not each.stale]
-        stale += [f"{kind.title} of {each.label} is left out: it is out of date." for each in every if each.stale]
+        fresh = [each for each in every if kind.is_history or not each.stale]
+        stale += [f"{kind.title} of {each.label} is out of date and not shown." for each in every if each not in fresh]
         figures: list[Figure] = []
         for each in fresh[:MOST_MAPS]:
             if isinstance(each.record, Verification):

@@ -30,6 +30,7 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
 
     kind: ClassVar[str] = ""
     title: ClassVar[str] = ""
+    is_history: ClassVar[bool] = False  # also records of before are of interest
     operation: str = ""
     settings: dict[str, Any] = {}
     inputs: dict[str, str] = {}

@@ -11,7 +11,6 @@ from typing import Any, Literal
 import numpy as np
 
 from slviewer.calibration.diagnosis.verdict import Verdict
-from slviewer.calibration.drift.check import Drift
 from slviewer.calibration.stereo import StereoModel
 from slviewer.evaluation.crossvalidation import CrossValidation
 from slviewer.records.record import Record
@@ -224,15 +223,6 @@ class AcceptanceView:
 
 
 @dataclass(frozen=True, eq=False)
-class DriftRow:
-    """One drift check; ``current``: of the calibration that the session holds now. ``time`` is ISO 8601, UTC."""
-
-    drift: Drift
-    time: str
-    current: bool = True
-
-
-@dataclass(frozen=True, eq=False)
 class SessionData:
     """A session's captures, its calibrations, and the measurements made with them.
 
@@ -251,7 +241,6 @@ class SessionData:
     verdict_of_calibration: bool = True
     models: ModelsView | None = None
     acceptances: Sequence[AcceptanceView] = ()
-    drifts: Sequence[DriftRow] = ()
     measurements: Sequence[Measurement] = ()  # but deviations
     sections: Sequence[tuple[str, Sequence[np.ndarray]]] = ()
     deviations: Sequence[tuple[Measurement, Mapping[str, np.ndarray]]] = ()

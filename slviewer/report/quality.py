@@ -1,4 +1,4 @@
-"""Sections on the quality of a calibration: verdict, comparison of models, acceptance tests, drift."""
+"""Sections on the quality of a calibration: verdict, comparison of models, acceptance tests."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -6,7 +6,7 @@ from typing import Any
 from slviewer.calibration.diagnosis.verdict import Verdict
 from slviewer.evaluation.crossvalidation import CrossValidation
 from slviewer.records.table import Cell, Column, Mark, Table
-from slviewer.report.data import AcceptanceView, DriftRow, ModelsView
+from slviewer.report.data import AcceptanceView, ModelsView
 from slviewer.report.page import Headline, Item, PageNotice, Section
 from slviewer.report.tables import UNKNOWN, format_number
 
@@ -189,33 +189,3 @@ def _budget_table(budget: Mapping[str, Any]) -> Table:
     notes = [f"Type A: from repeated observations; B: from anything else.{without}"]
     footer = [["expanded, k = 2", f"{budget['U_mm']:.4f}", "", ""]]
     return Table(columns, rows, f"Uncertainty of a length of {budget['length_mm']:.0f} mm", notes, footer)
-
-
-def drift_section(checks: Sequence[DriftRow]) -> Section:
-    """The section with the result of the last drift check, and the history."""
-    last = checks[-1].drift
-    is_still_good = last.verdict == "still good"
-    because = f", because {'; '.join(last.reasons)}" if last.reasons else ""
-    rows: list[list[str | Cell]] = []
-    for row in reversed(checks):
-        d = row.drift
-        across = UNKNOWN if d.across_px is None else f"{d.across_px:+.4f} ± {d.across_sigma_px:.4f}".replace("-", "−")
-        good = d.verdict == "still good"
-        rows.append(
-            [
-                row.time[:16].replace("T", " "),
-                d.capture,
-                Cell(d.verdict, "better" if good else "worse"),
-                f"{d.scale_ppm:+.0f} ± {d.scale_sigma_ppm:.0f}".replace("-", "−"),
-                across,
-                "this calibration" if row.current else "an older calibration",
-            ]
-        )
-    columns = [Column("time, UTC", align="left"), Column("capture", align="left"), Column("answer", align="left")]
-    columns += [Column("change of scale", "ppm"), Column("epipolar error", "px")]
-    columns.append(Column("of", align="left"))
-    items: list[Item] = [
-        PageNotice(f"{last.capture}: {last.verdict}{because}.", "good" if is_still_good else "warning"),
-        Table(columns, rows, "Drift checks, the latest first"),
-    ]
-    return Section("Drift", "One board against the saved calibration: whether the rig is still as it was.", items)

@@ -17,7 +17,6 @@ from slviewer.report.measurements import deviations_section, measurements_sectio
 from slviewer.report.page import Headline, Item, PageNotice, Section
 from slviewer.report.quality import (
     acceptance_section,
-    drift_section,
     models_section,
     verdict_headline,
     verdict_section,
@@ -103,8 +102,6 @@ def session_sections(data: SessionData) -> list[Section]:
     sections += [_records_section(view) for view in data.records]
     if data.acceptances:
         sections.append(acceptance_section(data.acceptances))
-    if data.drifts:
-        sections.append(drift_section(data.drifts))
     if data.measurements or data.sections:
         sections.append(measurements_section(data.measurements, data.sections))
     if data.deviations:
@@ -289,4 +286,5 @@ def _pixel_fits_section(data: SessionData) -> Section:
 def _records_section(view: RecordsView) -> Section:
     """The section with the tables and pictures of the records of one kind."""
     text = inspect.cleandoc(view.kind.__doc__ or "").split("\n\n")[0].replace("\n", " ")
-    return Section(view.kind.title, text, [*view.kind.tables(view.records), *view.figures])
+    notices = [PageNotice(f"{each.summary()}.") for each in view.records.values() if not each.is_good]
+    return Section(view.kind.title, text, [*notices, *view.kind.tables(view.records), *view.figures])

@@ -176,19 +176,6 @@ class _Inspection(ResultMeta, total=False):
     parts: Required[list[dict[str, Any]]]
 
 
-class _DriftCheck(TypedDict):
-    """The entries of a drift check that are no figures."""
-
-    time: str
-    calibration: str
-
-
-class _Drift(ResultMeta, total=False):
-    """`drift/*`."""
-
-    checked: _DriftCheck
-
-
 class _Acceptance(ResultMeta, total=False):
     """`acceptance/*`."""
 
@@ -217,7 +204,6 @@ _TYPES: dict[str, Any] = {
     "edits": _Edits,
     "measurements": _Measurement,
     "inspection": _Inspection,
-    "drift": _Drift,
     "acceptance": _Acceptance,
     "scale": _Scale,
 }

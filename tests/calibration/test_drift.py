@@ -9,12 +9,14 @@ import pytest
 from facts import missing_facts, raises
 from simulated_views import BOARD, moved, poses, seen
 
-from slviewer.calibration.drift.check import Drift, check_drift
+from slviewer.calibration.drift.check import check_drift
 from slviewer.calibration.drift.reference import MIN_POSES, DriftReference, build_reference
 from slviewer.calibration.drift.view import DriftView
 from slviewer.calibration.stereo import calibrate_stereo
 from slviewer.errors import InputError
+from slviewer.records.drift import Drift
 from slviewer.records.plain import from_plain, to_plain
+from slviewer.records.table import render_text
 from slviewer.simulation.boards import Pose
 from slviewer.simulation.rig import letter
 
@@ -100,7 +102,7 @@ def test_an_answer_survives_json(reference):
     found = checked(reference, moved(RIG, (0.05, 0.05, 0)), 4)
     assert from_plain(json.loads(json.dumps(to_plain(found))), Drift) == found
     assert found.verdict == "recalibrate" and found.reasons
-    assert missing_facts(found.text(), found.verdict, *found.reasons) == []
+    assert missing_facts("\n".join(map(render_text, Drift.tables({"1": found}))), found.verdict, *found.reasons) == []
 
 
 def test_too_few_poses_set_no_floor(reference):

@@ -159,29 +159,28 @@ def capture_board(folder: Path, name: str) -> None:
 @pytest.mark.slow
 def test_check_finds_a_projector_that_was_turned(calibrated: Path) -> None:
     capture_board(calibrated, "panned")
-    panned = check(calibrated, "panned")
-    assert panned.drift.verdict == "recalibrate" and not missing_facts(panned.drift.reasons[0], "pan")
+    panned = check(calibrated, "panned").only
+    assert panned.verdict == "recalibrate" and not missing_facts(panned.reasons[0], "pan")
     with Session.open(calibrated) as store:
-        assert load_drift_history(store) == (panned.latest,) and store.state_of(REFERENCE) == "fresh"
+        assert load_drift_history(store) == [panned] and store.state_of(REFERENCE) == "fresh"
 
 
 @pytest.mark.slow
 def test_check_answers_and_remembers(calibrated: Path) -> None:
     for name in ("same", "panned", "one_axis"):
         capture_board(calibrated, name)
-    same = check(calibrated, "same")
-    assert same.drift.verdict == "still good" and same.before == ()
-    panned = check(calibrated, "panned")
-    assert panned.drift.verdict == "recalibrate" and not missing_facts(panned.drift.reasons[0], "pan")
-    assert [(c.drift.capture, c.drift.verdict) for c in panned.before] == [("same", "still good")]
-    assert not missing_facts(panned.text(), "same", "still good")
-    single = check(calibrated, "one_axis")
-    assert single.drift.verdict == "still good" and any(not missing_facts(s, "axis x") for s in single.drift.unseen)
+    first = check(calibrated, "same")
+    assert first.only.verdict == "still good" and first.notes == ()
+    second = check(calibrated, "panned")
+    panned = second.only
+    assert panned.verdict == "recalibrate" and not missing_facts(panned.reasons[0], "pan")
+    assert not missing_facts(second.text(), "same", "still good", f"{panned.scale_ppm:.0f}".replace("-", "−"))
+    single = check(calibrated, "one_axis").only
+    assert single.verdict == "still good" and any(not missing_facts(s, "axis x") for s in single.unseen)
     with Session.open(calibrated) as store:
-        assert [c.drift.capture for c in load_drift_history(store)] == ["same", "panned", "one_axis"]
-        assert load_drift_history(store)[1] == panned.latest
+        assert [each.capture for each in load_drift_history(store)] == ["same", "panned", "one_axis"]
+        assert load_drift_history(store)[1] == panned
         assert store.state_of(REFERENCE) == "fresh"
-    assert json.loads(json.dumps(single.to_json()))["before"][1]["verdict"] == "recalibrate"
 
 
 def test_a_calibration_from_elsewhere_has_no_floor(bare):

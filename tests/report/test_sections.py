@@ -10,11 +10,12 @@ from facts import missing_facts
 from made_up import MODELS, plane_rows, reproduction_data, session_data, sphere_rows
 
 from slviewer.calibration.diagnosis.verdict import Finding, Verdict
-from slviewer.calibration.drift.check import Drift
 from slviewer.calibration.stereo import StereoModel
 from slviewer.evaluation.crossvalidation import CrossValidation, HeldOutPose
+from slviewer.records.drift import Drift
 from slviewer.records.table import Cell, Table
-from slviewer.report.data import AcceptanceView, CalibrationFigures, DriftRow, ModelsView, PlaneRow, SpacingRow
+from slviewer.records.verification import ModelFit, Verification
+from slviewer.report.data import AcceptanceView, CalibrationFigures, ModelsView, PlaneRow, RecordsView, SpacingRow
 from slviewer.report.page import Figure, PageNotice, Section, write_page
 from slviewer.report.reproduction import (
     inside_ratio,
@@ -97,7 +98,7 @@ def test_where_pixelwise_loses_it_is_said(tables: list[Section]) -> None:
     assert first["pixelwise", "against stereo"] == Cell("1.63 × worse", "worse")
     assert third["pixelwise", "RMS"] == Cell("0.076", "better") and third["stereo", "RMS"] == "0.198"
     assert third["pixelwise", "floor"] == Cell("0.036", "muted")
-    assert by_title(table, 7)["pixelwise", "against stereo"] == "equal"
+    assert by_title(table, 7)["pixelwise", "against stereo"] == Cell("equal")
 
 
 def test_the_ratio_counts_the_planes_inside() -> None:
@@ -242,16 +243,24 @@ def test_how_good_a_calibration_is() -> None:
     }
     three = (0.0, 0.1, 0.0)
     drift = Drift(
-        "plane_01", ("x",), "recalibrate", ("the board seems too large",), three, three, three, three, 0.0, 0.1, 420.0,
-        66.0, None, None, 0.02, 0.01, (0.1,) * 6, (),
+        capture="plane_01", axes=("x",), verdict="recalibrate", reasons=("the board seems too large",), turn_mrad=three,
+        turn_sigma_mrad=three, shift_mm=three, shift_sigma_mm=three, baseline_mm=0.0, baseline_sigma_mm=0.1,
+        scale_ppm=420.0, scale_sigma_ppm=66.0, across_px=None, across_sigma_px=None, misfit_px=0.02, chance=0.01,
+        seen_alone=(0.1,) * 6, unseen=(), time="2026-11-22T10:00:00+00:00",
     )  # fmt: skip
+    balls = {
+        name: Verification(
+            shape="sphere",
+            models={m: ModelFit(9, 0, 0.1, centre_mm=(x, 0.0, 500.0)) for m, x in (("stereo", a), ("splined", b))},
+        )
+        for name, a, b in (("a", 0.0, 0.0), ("b", 60.6, 60.5))
+    }
     data = dataclasses.replace(
         session_data(WIDTH),
         verdict=verdict,
         models=ModelsView("stereo", "splined", compared, splined, {"splined": "scale corrected by +300 ppm"}),
         acceptances=[AcceptanceView(found, "2026-11-21T10:00:00+00:00")],
-        drifts=[DriftRow(drift, "2026-11-22T10:00:00+00:00")],
-        spacings=[SpacingRow("a to b", float("nan"), {"stereo": 60.6, "splined": 60.5})],
+        records=[RecordsView(Drift, {"1": drift}), RecordsView(Verification, balls)],
     )
     assert session_headlines(data)[0].value == "doubtful"
     words = "\n".join(texts(section) for section in session_sections(data))
@@ -271,6 +280,6 @@ def test_how_good_a_calibration_is() -> None:
         "plane_01",
         "recalibrate",
         "the board seems too large",
-        "60.500",
+        "60.5",
     )
     assert missing_facts(words, *facts) == []

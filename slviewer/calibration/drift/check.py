@@ -7,8 +7,6 @@ pattern off its epipolar lines.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from scipy.special import fdtrc, fdtri
@@ -18,6 +16,8 @@ from slviewer.calibration.drift.view import DriftView
 from slviewer.errors import InputError
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.vectors import rms, unit_vectors
+from slviewer.records.drift import Drift
+from slviewer.records.verification import Vector
 
 FALSE_ALARMS = 1e-4
 """False-alarm probability of one check; a check precedes every day's work."""
@@ -27,7 +27,6 @@ MAX_MISFIT_RATIO = 3.0
 """Largest RMS that no movement explains, over that of the calibration's worst pose."""
 TURN_MRAD, SHIFT_MM = 0.05, 0.010
 """Changes that must be detectable."""
-Verdict = Literal["still good", "recalibrate"]
 _MOVES = (
     ("turn about its x axis (nod)", "rows", "y"),
     ("turn about its y axis (pan)", "columns", "x"),
@@ -36,62 +35,6 @@ _MOVES = (
     ("shift along its y axis", "rows", "y"),
     ("shift along its optical axis", "rows and columns", "y"),
 )
-
-
-@dataclass(frozen=True)
-class Drift:
-    """Result of the drift check; sigmas are standard deviations.
-
-    ``turn_mrad``, ``shift_mm`` (3,): estimated rotation about and translation along the projector's own axes.
-    ``scale_ppm``: apparent growth of the board; ``across_px``: mean offset across the epipolar lines, None with one
-    axis; ``misfit_px``: RMS that no movement explains. ``chance``: p-value of the change if nothing moved.
-    ``seen_alone`` (6,): size in mrad and mm at which each rotation and translation would be detected with 95 %
-    probability if it were the only change. ``unseen``: descriptions of changes that would not be detected.
-    """
-
-    capture: str
-    axes: tuple[Axis, ...]
-    verdict: Verdict
-    reasons: tuple[str, ...]
-    turn_mrad: tuple[float, ...]
-    turn_sigma_mrad: tuple[float, ...]
-    shift_mm: tuple[float, ...]
-    shift_sigma_mm: tuple[float, ...]
-    baseline_mm: float
-    baseline_sigma_mm: float
-    scale_ppm: float
-    scale_sigma_ppm: float
-    across_px: float | None
-    across_sigma_px: float | None
-    misfit_px: float
-    chance: float
-    seen_alone: tuple[float, ...]
-    unseen: tuple[str, ...]
-
-    def text(self) -> str:
-        """Return a report of several lines for the terminal: the verdict, then the figures behind it."""
-        answer = self.verdict if not self.reasons else f"{self.verdict}, because {'; '.join(self.reasons)}"
-        across = (
-            "off its epipolar lines: not known from one axis"
-            if self.across_px is None
-            else f"off its epipolar lines by {self.across_px:+.4f} +- {self.across_sigma_px:.4f} px"
-        )
-        shifts, shift_sigmas = ([1e3 * s for s in three] for three in (self.shift_mm, self.shift_sigma_mm))
-        lines = [
-            f"{self.capture}: {answer}",
-            f"  the board seems {self.scale_ppm:+.0f} +- {self.scale_sigma_ppm:.0f} ppm larger than it is; {across}",
-            f"  projector turned by {_format_xyz(self.turn_mrad, self.turn_sigma_mrad, '.3f')} mrad about its x, y, z",
-            f"  and shifted by {_format_xyz(shifts, shift_sigmas, '.0f')} um;"
-            f" baseline {1e3 * self.baseline_mm:+.0f} +- {1e3 * self.baseline_sigma_mm:.0f} um",
-            "  a pan and a shift along x look nearly alike, as do a nod and a shift along y: their sum is known far "
-            "better than each",
-            "  detectable if it is the only change: turns from "
-            + ", ".join(f"{s:.4f}" for s in self.seen_alone[:3])
-            + " mrad, shifts from "
-            + ", ".join(f"{1e3 * s:.1f}" for s in self.seen_alone[3:])
-            + " um",
-        ]
-        return "\n".join(lines + [f"  not detectable: {what}" for what in self.unseen])
 
 
 def check_drift(reference: DriftReference, view: DriftView) -> Drift:
@@ -139,10 +82,10 @@ def check_drift(reference: DriftReference, view: DriftView) -> Drift:
         axes=view.axes,
         verdict="recalibrate" if reasons else "still good",
         reasons=tuple(reasons),
-        turn_mrad=_to_floats(1e3 * estimate.change[:3]),
-        turn_sigma_mrad=_to_floats(1e3 * sigmas[:3]),
-        shift_mm=_to_floats(estimate.change[3:]),
-        shift_sigma_mm=_to_floats(sigmas[3:]),
+        turn_mrad=_to_vector(1e3 * estimate.change[:3]),
+        turn_sigma_mrad=_to_vector(1e3 * sigmas[:3]),
+        shift_mm=_to_vector(estimate.change[3:]),
+        shift_sigma_mm=_to_vector(sigmas[3:]),
         baseline_mm=float(along @ estimate.change),
         baseline_sigma_mm=float(np.sqrt(along @ C @ along)),
         scale_ppm=1e6 * estimate.scale,
@@ -151,7 +94,7 @@ def check_drift(reference: DriftReference, view: DriftView) -> Drift:
         across_sigma_px=across_sigma,
         misfit_px=estimate.misfit_px,
         chance=chance,
-        seen_alone=_to_floats(seen_alone),
+        seen_alone=(*_to_vector(seen_alone[:3]), *_to_vector(seen_alone[3:])),
         unseen=(*_list_undetermined(seen_alone, view.axes), "common motion of both devices (harmless)"),
     )
 
@@ -192,11 +135,7 @@ def _list_undetermined(seen_alone: np.ndarray, axes: Sequence[Axis]) -> list[str
     return undetermined
 
 
-def _format_xyz(values: Sequence[float], sigmas: Sequence[float], form: str) -> str:
-    """Format values with their sigmas: "+1.0 +- 0.1, ..."."""
-    return ", ".join(f"{value:+{form}} +- {sigma:{form}}" for value, sigma in zip(values, sigmas, strict=True))
-
-
-def _to_floats(values: np.ndarray) -> tuple[float, ...]:
-    """Convert an array (n,) to a tuple of floats."""
-    return tuple(float(value) for value in values)
+def _to_vector(values: np.ndarray) -> Vector:
+    """Convert an array (3,) to plain numbers."""
+    x, y, z = map(float, values)
+    return x, y, z

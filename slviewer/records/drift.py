@@ -1,0 +1,126 @@
+"""Whether a saved calibration is still good, by one later capture of its board."""
+
+from collections.abc import Mapping
+from typing import Any, ClassVar, Literal
+
+from slviewer.records.record import Record
+from slviewer.records.table import Cell, Column, Table, Value
+from slviewer.records.verification import Vector
+
+DriftVerdict = Literal["still good", "recalibrate"]
+
+
+class Drift(Record, frozen=True, kw_only=True):
+    """One board against the saved calibration: whether the rig is still as it was.
+
+    Sigmas are standard deviations. ``turn_mrad``, ``shift_mm``: estimated rotation about and
+    translation along the projector's own axes. ``scale_ppm``: apparent growth of the board;
+    ``across_px``: mean offset across the epipolar lines, None with one axis; ``misfit_px``: RMS that
+    no movement explains. ``chance``: p-value of the change if nothing moved. ``seen_alone``: size in
+    mrad and mm at which each rotation and translation would be detected with 95 % probability if it
+    were the only change. ``unseen``: descriptions of changes that would not be detected. ``time``:
+    ISO 8601, UTC.
+    """
+
+    kind: ClassVar[str] = "drift"
+    title: ClassVar[str] = "Drift"
+    is_history: ClassVar[bool] = True
+    capture: str
+    axes: tuple[Literal["x", "y"], ...]
+    verdict: DriftVerdict
+    reasons: tuple[str, ...]
+    turn_mrad: Vector
+    turn_sigma_mrad: Vector
+    shift_mm: Vector
+    shift_sigma_mm: Vector
+    baseline_mm: float
+    baseline_sigma_mm: float
+    scale_ppm: float
+    scale_sigma_ppm: float
+    across_px: float | None
+    across_sigma_px: float | None
+    misfit_px: float
+    chance: float
+    seen_alone: tuple[float, float, float, float, float, float]
+    unseen: tuple[str, ...]
+    time: str = ""
+
+    @classmethod
+    def upgrade(cls, meta: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Convert a record of version 0.2, whose figures were one entry."""
+        if not isinstance(old := meta.get("checked"), Mapping):
+            return meta
+        settings = {"capture": old.get("capture")}
+        return {**old, "inputs": meta.get("inputs", {}), "operation": "check", "settings": settings}
+
+    @property
+    def is_good(self) -> bool:
+        """Whether the calibration is still good."""
+        return self.verdict == "still good"
+
+    def summary(self) -> str:
+        """Return the verdict and its reasons in one sentence."""
+        because = f", because {'; '.join(self.reasons)}" if self.reasons else ""
+        return f"{self.capture}: {self.verdict}{because}"
+
+    def figures(self) -> dict[str, float]:
+        """Return the apparent growth of the board, and what no movement explains."""
+        return {"scale_ppm": self.scale_ppm, "misfit_px": self.misfit_px}
+
+    @classmethod
+    def tables(cls, found: Mapping[str, "Drift"]) -> list[Table]:  # type: ignore[override]
+        """Return a table of the checks, the latest first, and one of what the latest found of each axis."""
+        columns = [
+            Column("check", align="left"),
+            Column("time, UTC", align="left", detail=True),
+            Column("capture", align="left"),
+            Column("answer", align="left"),
+            Column("change of scale", "ppm", digits=0),
+            Column("±", "ppm", digits=0),
+            Column("epipolar error", "px", digits=4),
+            Column("±", "px", digits=4, detail=True),
+            Column("misfit", "px", detail=True),
+        ]
+        rows: list[list[Value | Cell]] = [
+            [
+                name,
+                each.time[:16].replace("T", " "),
+                each.capture,
+                Cell(each.verdict, "better" if each.is_good else "worse"),
+                each.scale_ppm,
+                each.scale_sigma_ppm,
+                each.across_px,
+                each.across_sigma_px,
+                each.misfit_px,
+            ]
+            for name, each in reversed(list(found.items()))
+        ]
+        *_, (name, latest) = found.items()
+        return [
+            Table(columns, rows, "Drift checks, the latest first").without_empty(),
+            latest._list_movements(name),
+        ]
+
+    def _list_movements(self, name: str) -> Table:
+        columns = [
+            Column("axis of the projector", align="left"),
+            Column("turn", "mrad"),
+            Column("±", "mrad"),
+            Column("shift", "µm", digits=0),
+            Column("±", "µm", digits=0),
+            Column("turn", "mrad", "detectable", digits=4, detail=True),
+            Column("shift", "µm", "detectable", digits=1, detail=True),
+        ]
+        shifts, sigmas, seen = ([1e3 * mm for mm in three] for three in (
+            self.shift_mm, self.shift_sigma_mm, self.seen_alone[3:]
+        ))  # fmt: skip
+        figures = self.turn_mrad, self.turn_sigma_mrad, shifts, sigmas, self.seen_alone[:3], seen
+        rows = [list(row) for row in zip("xyz", *figures, strict=True)]
+        notes = [
+            f"{self.summary()}.",
+            f"Baseline {1e3 * self.baseline_mm:+.0f} ± {1e3 * self.baseline_sigma_mm:.0f} µm.".replace("-", "−"),
+            "A pan and a shift along x look nearly alike, as do a nod and a shift along y: their sum is "
+            "known far better than each. Detectable: if it is the only change.",
+            *(f"Not detectable: {what}." for what in self.unseen),
+        ]
+        return Table(columns, rows, f"Check {name}: how the projector has moved", notes)
