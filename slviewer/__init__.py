@@ -36,24 +36,36 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from slviewer import plugins
+    from slviewer.devices.capture import capture_frames
+    from slviewer.devices.simulated import simulated_rig
+    from slviewer.devices.world import SimulatedWorld
     from slviewer.errors import SlviewerError
     from slviewer.evaluation.plane import evaluate_plane
     from slviewer.evaluation.sphere import evaluate_sphere
     from slviewer.fringe.decode import decode, texture
     from slviewer.fringe.description_check import check_description
-    from slviewer.fringe.phase import PhaseMap
+    from slviewer.fringe.phase import PhaseMap, Reason
     from slviewer.fringe.presets import complementary, gray, micro, multifrequency, p18
-    from slviewer.fringe.sequence import Frame, PatternSequence
+    from slviewer.fringe.sequence import Frame, PatternSequence, one_axis
     from slviewer.inspection.quantities import Quantity
     from slviewer.pipeline import datasets
+    from slviewer.pipeline.accept import accept
     from slviewer.pipeline.align import align
+    from slviewer.pipeline.batch import batch
     from slviewer.pipeline.calibrate import CalibrationResult, calibrate, calibrate_frames, save_calibration
+    from slviewer.pipeline.capture import capture
+    from slviewer.pipeline.check import check
+    from slviewer.pipeline.compare import compare
+    from slviewer.pipeline.export import export
     from slviewer.pipeline.import_captures import import_captures, read_captures
     from slviewer.pipeline.measure import measure
     from slviewer.pipeline.merge import merge
     from slviewer.pipeline.mesh import mesh
     from slviewer.pipeline.models import load_calibration
     from slviewer.pipeline.reconstruct import reconstruct
+    from slviewer.pipeline.report import report
+    from slviewer.pipeline.session_operations import SessionOperations as Session
+    from slviewer.pipeline.simulate import simulate
     from slviewer.pipeline.stored_records import load_arrays
     from slviewer.pipeline.verify import verify
     from slviewer.reconstruction.cloud import Cloud
@@ -63,8 +75,10 @@ if TYPE_CHECKING:
     from slviewer.report.maps import error_maps as draw_error_maps
     from slviewer.session.measurements import Measurement
     from slviewer.session.ply import read_ply, write_ply
-    from slviewer.session.store import Session
+    from slviewer.simulation.boards import Pose
+    from slviewer.simulation.rig import letter as letter_rig
     from slviewer.surface.fuse import fuse as fuse_clouds
+    from slviewer.surface.meshing import MeshingPlan
     from slviewer.surface.meshing import build_mesh as mesh_cloud
     from slviewer.target.board import Board
     from slviewer.target.detect import detect as detect_board
@@ -80,17 +94,27 @@ _EXPORTS = {
     "Cloud": "reconstruction.cloud",
     "Frame": "fringe.sequence",
     "Measurement": "session.measurements",
+    "MeshingPlan": "surface.meshing",
     "PatternSequence": "fringe.sequence",
     "PhaseMap": "fringe.phase",
+    "Pose": "simulation.boards",
     "Quantity": "inspection.quantities",
-    "Session": "session.store",
+    "Reason": "fringe.phase",
+    "Session": "pipeline.session_operations:SessionOperations",
+    "SimulatedWorld": "devices.world",
     "SlviewerError": "errors",
     "Verification": "records.verification",
+    "accept": "pipeline.accept",
     "align": "pipeline.align",
     "align_clouds": "registration.multiway:register_all",
+    "batch": "pipeline.batch",
     "calibrate": "pipeline.calibrate",
     "calibrate_frames": "pipeline.calibrate",
+    "capture": "pipeline.capture",
+    "capture_frames": "devices.capture",
+    "check": "pipeline.check",
     "check_description": "fringe.description_check",
+    "compare": "pipeline.compare",
     "complementary": "fringe.presets",
     "datasets": "pipeline.datasets:*",
     "decode": "fringe.decode",
@@ -98,9 +122,11 @@ _EXPORTS = {
     "draw_error_maps": "report.maps:error_maps",
     "evaluate_plane": "evaluation.plane",
     "evaluate_sphere": "evaluation.sphere",
+    "export": "pipeline.export",
     "fuse_clouds": "surface.fuse:fuse",
     "gray": "fringe.presets",
     "import_captures": "pipeline.import_captures",
+    "letter_rig": "simulation.rig:letter",
     "load_arrays": "pipeline.stored_records",
     "load_calibration": "pipeline.models",
     "measure": "pipeline.measure",
@@ -109,13 +135,17 @@ _EXPORTS = {
     "mesh_cloud": "surface.meshing:build_mesh",
     "micro": "fringe.presets",
     "multifrequency": "fringe.presets",
+    "one_axis": "fringe.sequence",
     "p18": "fringe.presets",
     "plugins": "plugins:*",
     "read_captures": "pipeline.import_captures",
     "read_ply": "session.ply",
     "reconstruct": "pipeline.reconstruct",
     "reconstruct_cloud": "reconstruction.reconstruct",
+    "report": "pipeline.report",
     "save_calibration": "pipeline.calibrate",
+    "simulate": "pipeline.simulate",
+    "simulated_rig": "devices.simulated",
     "texture": "fringe.decode",
     "verify": "pipeline.verify",
     "write_ply": "session.ply",
@@ -123,13 +153,16 @@ _EXPORTS = {
 """{public name: module}, or module:name where it has another name there, or module:* for the module itself."""
 
 __all__ = [
-    "Board", "CalibrationResult", "Cloud", "Frame", "Measurement", "PatternSequence", "PhaseMap",
-    "Quantity", "Session", "SlviewerError", "Verification", "align", "align_clouds", "calibrate",
-    "calibrate_frames", "check_description", "complementary", "datasets", "decode", "detect_board",
-    "draw_error_maps", "evaluate_plane", "evaluate_sphere", "fuse_clouds", "gray",
-    "import_captures", "load_arrays", "load_calibration", "measure", "merge", "mesh", "mesh_cloud",
-    "micro", "multifrequency", "p18", "plugins", "read_captures", "read_ply", "reconstruct",
-    "reconstruct_cloud", "save_calibration", "texture", "verify", "write_ply",
+    "Board", "CalibrationResult", "Cloud", "Frame", "Measurement", "MeshingPlan",
+    "PatternSequence", "PhaseMap", "Pose", "Quantity", "Reason", "Session", "SimulatedWorld",
+    "SlviewerError", "Verification", "accept", "align", "align_clouds", "batch", "calibrate",
+    "calibrate_frames", "capture", "capture_frames", "check", "check_description", "compare",
+    "complementary", "datasets", "decode", "detect_board", "draw_error_maps", "evaluate_plane",
+    "evaluate_sphere", "export", "fuse_clouds", "gray", "import_captures", "letter_rig",
+    "load_arrays", "load_calibration", "measure", "merge", "mesh", "mesh_cloud", "micro",
+    "multifrequency", "one_axis", "p18", "plugins", "read_captures", "read_ply", "reconstruct",
+    "reconstruct_cloud", "report", "save_calibration", "simulate", "simulated_rig", "texture",
+    "verify", "write_ply",
 ]  # fmt: skip
 
 

@@ -2,6 +2,7 @@
 
 import re
 import runpy
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -64,6 +65,24 @@ def test_a_session_is_made_and_measured(images: Path, tmp_path: Path, run: Run) 
     assert "verdict: good" in said
     assert int(re.findall(r"(\d+) points in", said)[0]) > 5000
     assert sl.load_calibration(tmp_path / "session").name == "stereo"
+
+
+def test_examples_need_nothing_below_slviewer() -> None:
+    files = [path for path in EXAMPLES.iterdir() if path.suffix in (".py", ".ipynb")]
+    below = {path.name: re.findall(r"(?:from|import) (slviewer\.[\w.]+)", path.read_text()) for path in files}
+    assert len(files) > 8 and not [name for name, modules in below.items() if modules]
+
+
+@pytest.mark.computes
+def test_a_session_has_the_operations_as_methods(recorded: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(recorded / "session", tmp_path / "session")
+    with sl.Session.open(folder, write=True) as session:
+        found = session.verify(["plane_03"], "plane")
+        assert found["plane_03"].best == "splined" and session.state_of("verify/plane_03") == "fresh"
+        again = sl.verify(folder.as_posix(), ["plane_03"], "plane")  # read, as the session is open for writing
+        assert again["plane_03"].models == found["plane_03"].models
+        assert session.load_arrays("verify/plane_03")["error_splined"].shape == (300, 400)
+        assert session.reconstruct("object_r1").only.points > 10_000
 
 
 @pytest.mark.process

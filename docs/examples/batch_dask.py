@@ -10,16 +10,14 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 
 import slviewer as sl
-from slviewer.pipeline.batch import batch
-from slviewer.pipeline.simulate import simulate
 
 
 def main() -> None:
     """Simulate a session, calibrate it, and reconstruct its planes in parallel."""
     session = Path(tempfile.mkdtemp()) / "session"
-    simulate(session, scale=0.15, poses=6)
+    sl.simulate(session, scale=0.15, poses=6)
     sl.calibrate(session, "circles:21x16:9", models=["stereo"])
-    done = batch([session], "verify", captures=["plane_*"], shape="plane")
+    done = sl.batch([session], "verify", captures=["plane_*"], shape="plane")
     print(done.text())
     assert not done.failed
 

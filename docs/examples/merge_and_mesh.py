@@ -7,18 +7,16 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 
 import slviewer as sl
-from slviewer.pipeline.simulate import simulate
-from slviewer.surface.meshing import MeshingPlan
 
 SCALE = 0.2  # of 1600x1200 px
 session = tempfile.mkdtemp() + "/session"
-simulate(session, preset="turn", scale=SCALE, poses=8)
+sl.simulate(session, preset="turn", scale=SCALE, poses=8)
 sl.calibrate(session, "circles:21x16:9")
 scans = ["object_r1", "object_r2", "object_r3"]
 merged = sl.merge(session, scans, "object_r2")
 for scan, pair in merged.only.pairs.items():
     print(f"{scan}: {pair.rms_mm:.3f} mm from the reference where they overlap")
-meshed = sl.mesh(session, ["merge/1"], plan=MeshingPlan(triangles=20_000))
+meshed = sl.mesh(session, ["merge/1"], plan=sl.MeshingPlan(triangles=20_000))
 print(meshed.text())
 
 surface = sl.read_ply(merged.files[0])

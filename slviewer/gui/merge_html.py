@@ -12,7 +12,7 @@ from slviewer.registration.refusal import Reason
 
 def merge_html(merge: Stored[Merge], labels: Mapping[str, str]) -> Html:
     """Describe a merge: the registered pairs, their loops, and what was excluded."""
-    html = records_html([merge], labels)
+    html = records_html([merge], labels, named=False)
     if len(merge.record.scans) == 3:
         html += _letter_html(merge.record)
     return html + paragraph(help_link("merge")) if merge.record.refused else html

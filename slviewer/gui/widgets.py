@@ -121,14 +121,16 @@ def report_table(shown: Table) -> Html:
     return caption + table(titles, rows, aligned) + notes
 
 
-def records_html(found: Sequence[Stored[Any]], labels: Mapping[str, str] = MappingProxyType({})) -> Html:
+def records_html(
+    found: Sequence[Stored[Any]], labels: Mapping[str, str] = MappingProxyType({}), *, named: bool = True
+) -> Html:
     """Return the tables of records of one kind, with the operator's ``labels`` for names of captures; a warning names
-    those that are stale."""
+    those that are stale. Not ``named``: of one record, whose name stands above."""
     if not found:
         return Html("")
     kind, shown = type(found[0].record), {each.label: each.record for each in found}
     tables = [relabel(each, labels) for each in kind.tables(shown)]
-    if len(found) == 1:  # whose name stands above
+    if not named:
         tables = [replace(each.without_constant(), caption="") for each in tables]
     html = "".join(map(report_table, tables))
     if stale := ", ".join(each.label for each in found if each.stale):

@@ -3,7 +3,7 @@
 import inspect
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
-from functools import update_wrapper
+from functools import partial, update_wrapper
 from pathlib import Path
 from typing import Any, Generic, ParamSpec, TypeVar
 
@@ -102,6 +102,10 @@ class Operation(Generic[P, S, R]):
     def __call__(self, session: SessionLike, *args: P.args, **kwargs: P.kwargs) -> Findings[R]:
         """Run the operation on a session with these settings, and return what it found."""
         return self.run(session, self.settings(*args, **kwargs))
+
+    def __get__(self, session: Session, owner: type | None = None) -> Callable[P, Findings[R]]:
+        """Return the operation as a method of a session."""
+        return partial(self, session)
 
     def run(
         self,

@@ -4,7 +4,7 @@ import contextlib
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Literal, TypeVar, get_args
+from typing import Any, Literal, Self, TypeVar, get_args
 
 import numpy as np
 
@@ -52,7 +52,7 @@ class Session(Decisions):
     # opening and closing
 
     @classmethod
-    def create(cls, path: str | Path) -> "Session":
+    def create(cls, path: str | Path) -> Self:
         """A new session, open for writing, in a new or empty folder; SessionError where something is there already."""
         folder, is_new_folder = layout.new_folder(path)
         lock = WriterLock(folder)
@@ -68,7 +68,7 @@ class Session(Decisions):
         return session
 
     @classmethod
-    def open(cls, path: str | Path, write: bool = False) -> "Session":
+    def open(cls, path: str | Path, write: bool = False) -> Self:
         """Open an existing session, for reading, or for writing by this process alone.
 
         Raises SessionError where there is no session, where it is damaged or of a newer schema, or where another
@@ -87,7 +87,7 @@ class Session(Decisions):
         return session
 
     @classmethod
-    def open_or_create(cls, path: str | Path) -> "Session":
+    def open_or_create(cls, path: str | Path) -> Self:
         """The session in a folder, open for writing; made where the folder is missing or empty."""
         before = ""
         for _ in range(5):  # attempts: another process may create or remove it meanwhile
@@ -114,17 +114,17 @@ class Session(Decisions):
         if self._lock is not None:
             self._lock.release()
 
-    def guarded(self, allow: Callable[[], None]) -> "Session":
+    def guarded(self, allow: Callable[[], None]) -> Self:
         """This session for one piece of work: `allow` is called before each save takes effect; it may raise to stop it.
 
         So work that was given up can run on without ever changing the folder. Closing it closes this session too.
         """
-        view = Session(self.folder, self._lock)
+        view = type(self)(self.folder, self._lock)
         view._decisions_lock = self._decisions_lock
         view._allow = allow
         return view
 
-    def __enter__(self) -> "Session":
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:

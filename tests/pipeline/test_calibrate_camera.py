@@ -55,5 +55,5 @@ def test_a_camera_is_calibrated_from_pictures(pictures: Path, run: Run, tmp_path
 
 def test_pictures_are_chosen_and_too_few_are_refused(pictures: Path, run: Run) -> None:
     status, _, error = run("calibrate", pictures, "--target", BOARD, "--camera-only", "--poses", "board_[01].png")
-    assert status == 3 and not missing_facts(error, "2 pictures")
+    assert status == 3 and not missing_facts(error, "2 usable poses")
     assert run("calibrate", pictures, "--target", BOARD, "--camera-only", "--exclude", "none*")[0] == 2

@@ -16,7 +16,9 @@ def test_waiting_begins_with_the_last_frame() -> None:
 
     def publish(capture: object = None, **changes: object) -> None:
         session.update(changes)
-        watch.note(SimpleNamespace(rig=SimpleNamespace(capture=capture), session=SimpleNamespace(**session)))  # type: ignore[arg-type]
+        records = session["verifications"]
+        shown = SimpleNamespace(**session, list_records=lambda kind: records)
+        watch.note(SimpleNamespace(rig=SimpleNamespace(capture=capture), session=shown))  # type: ignore[arg-type]
 
     def scans(*states: str) -> tuple[object, ...]:
         return tuple(SimpleNamespace(cloud=state, purpose="scan") for state in states)

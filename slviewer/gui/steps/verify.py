@@ -150,7 +150,7 @@ class Panel(StepPanel):
                 return
             models, shape = list(view.record.models), view.record.shape
             self._model.offer([(model, model) for model in models], models[-1])
-            self._figures.set(records_html([view]))
+            self._figures.set(records_html([view], named=False))
             context, key = self._context, (name, view.record.summary())
             self._painter.request("maps", key, lambda: _draw_maps(context.session, view), self._maps.set)
             model = self._model.value

@@ -1,0 +1,47 @@
+"""A session whose methods are the operations: what `slviewer.Session` is."""
+
+from slviewer.pipeline.accept import accept
+from slviewer.pipeline.calibrate import calibrate
+from slviewer.pipeline.compare import compare
+from slviewer.pipeline.edit import edit_scan, set_region
+from slviewer.pipeline.export import export
+from slviewer.pipeline.inspect import inspect
+from slviewer.pipeline.measure import measure
+from slviewer.pipeline.mesh import mesh
+from slviewer.pipeline.operations import align, check, merge, reconstruct, verify
+from slviewer.pipeline.plan import plan
+from slviewer.pipeline.report import report
+from slviewer.pipeline.stored_records import load_arrays
+from slviewer.pipeline.validate import validate
+from slviewer.session.store import Session
+
+
+class SessionOperations(Session):
+    """A session on disk: captures, results and decisions, and what is done with them.
+
+    Each method is the command of its name, with the session as first argument; it needs no open session to be called
+    as a function, as in ``slviewer.verify(folder, ["plane_01"], "plane")``::
+
+        with slviewer.Session.open("my-session", write=True) as session:
+            session.calibrate("circles:21x16:9")
+            session.reconstruct("object").only.points
+    """
+
+    accept = accept
+    align = align.align
+    calibrate = calibrate
+    check = check.check
+    compare = compare
+    edit_scan = edit_scan
+    export = export
+    inspect = inspect
+    load_arrays = load_arrays
+    measure = measure
+    merge = merge.merge
+    mesh = mesh
+    plan = plan
+    reconstruct = reconstruct.reconstruct
+    report = report
+    set_region = set_region
+    validate = validate
+    verify = verify.verify
