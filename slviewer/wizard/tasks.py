@@ -1,15 +1,7 @@
-"""The worker's jobs, one function each, and the results that they save in the session.
+"""The worker's jobs that are no operations yet, one function each.
 
-=====================  ============================================================================================
-`poses/<capture>`      the features of a target pose (`pipeline.poses`)
-`clouds/<capture>`     the organised cloud, with phase and modulation at each pixel (`pipeline.reconstruct`)
-`verify/<capture>`     error maps and figures of a plane or a sphere, model by model (`pipeline.verify`)
-`placement/<capture>`  where a scan is among those that are aligned as they come
-`merge/<number>`       the alignment of scans; the points are in `exports/merged_<number>.ply`
-=====================  ============================================================================================
-
-All of them name their inputs, so that stale results are detected. The frames of a capture are compared with each other
-by a job of their own (`engine`), which no cloud waits for.
+What they save names its inputs, so that stale results are detected. The frames of a capture are compared with each
+other by a job of their own (`engine`), which no cloud waits for.
 """
 
 from slviewer.errors import Cancelled, InputError, SlviewerError
