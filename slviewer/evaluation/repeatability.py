@@ -29,16 +29,6 @@ class Repeatability:
     wandering_mm: float
     sigma_map: np.ndarray
 
-    def text(self) -> str:
-        """Return the result in one sentence for the terminal."""
-        few = "" if self.captures >= CAPTURES else f" ({CAPTURES} are better)"
-        return (
-            f"repeatability over {self.captures} captures of a still object{few}: depth repeats to "
-            f"{self.sigma_mm:.4f} mm (median of {self.pixels} pixels; 95 % of them below {self.sigma_95_mm:.4f}); the "
-            f"noise predicts {self.predicted_mm:.4f} mm; the mean depth wandered by {self.wandering_mm:.4f} mm. "
-            "It says nothing of accuracy."
-        )
-
     def to_json(self) -> dict[str, Any]:
         """Return the fields without the map as plain values."""
         return {name: value for name, value in vars(self).items() if name != "sigma_map"}

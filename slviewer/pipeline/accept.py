@@ -1,10 +1,9 @@
 """The acceptance test: artefacts with certificates against the session's calibration."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -12,126 +11,110 @@ from slviewer.errors import InputError
 from slviewer.evaluation.acceptance.artefact import Artefact
 from slviewer.evaluation.acceptance.measure import SIZE, SPACING, Position, measure_artefact
 from slviewer.evaluation.acceptance.result import Acceptance, conclude_test
-from slviewer.evaluation.budget import Contribution, ErrorBudget
-from slviewer.evaluation.repeatability import Repeatability, repeatability
+from slviewer.evaluation.repeatability import repeatability
 from slviewer.pipeline.capture_clouds import capture_cloud, check_capture_sizes
 from slviewer.pipeline.capture_phases import capture_texture, decode_captures
 from slviewer.pipeline.check import load_drift_history
-from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings, part
-from slviewer.pipeline.models import ModelName, best_model, check_accepted, load_model, load_stereo, warn_if_stale
-from slviewer.pipeline.open_session import SessionLike, match_names, next_number, opened
+from slviewer.pipeline.feedback import part
+from slviewer.pipeline.models import (
+    Model,
+    ModelName,
+    best_model,
+    check_accepted,
+    load_model,
+    load_stereo,
+    warn_if_stale,
+)
+from slviewer.pipeline.open_session import match_names, next_number
+from slviewer.pipeline.operation import Found, Job, operation
 from slviewer.pipeline.reconstruct import segment_board
 from slviewer.pipeline.scale import record_scale, scale_factor
+from slviewer.records.acceptance import AcceptanceTest, Contribution, ErrorBudget
 from slviewer.records.drift import Drift
+from slviewer.records.plain import from_plain, to_plain
 from slviewer.session.reading import read_toml
 from slviewer.session.store import Session
 
 
 @dataclass(frozen=True)
-class AcceptanceResult:
-    """The result of ``accept``. ``factor`` is the scale correction in force during the test, ``applied`` the one
-    that it put in force, or None; ``budget`` of the artefact's length, None for a plane; ``repeatability`` where
-    still captures were named.
-    """
-
-    acceptance: Acceptance
-    factor: float
-    applied: float | None
-    budget: ErrorBudget | None
-    repeatability: Repeatability | None
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the published values of ``accept --json``."""
-        return self.acceptance.to_json() | {
-            "scale_factor": self.factor,
-            "scale_applied": self.applied,
-            "budget": None if self.budget is None else self.budget.to_json(),
-            "repeatability": None if self.repeatability is None else self.repeatability.to_json(),
-        }
-
-    def text(self) -> str:
-        """Return the result as a report for the terminal."""
-        blocks = [self.acceptance.text()]
-        if self.factor != 1.0:
-            blocks.append(f"a scale correction of {1e6 * (self.factor - 1):+.0f} ppm was in force during the test")
-        if self.applied is not None:
-            blocks.append(
-                f"scale correction recorded: clouds of {self.acceptance.model} are multiplied by {self.applied:.7f}"
-            )
-        elif self.acceptance.scale is not None:
-            blocks.append("the scale was not corrected: --apply-scale does so")
-        blocks += [part.text() for part in (self.budget, self.repeatability) if part is not None]
-        return "\n\n".join(blocks)
-
-
-def accept(
-    session: SessionLike,
-    artefact: Path | str,
-    *,
-    model: ModelName | None = None,
-    still: Sequence[str] = (),
-    apply_scale: bool = False,
-    progress: Progress = ignore_progress,
-    warn: Warn = ignore_warnings,
-) -> AcceptanceResult:
-    """Test a calibration with a ball bar, a sphere or a plane that has a certificate, against the operator's limits.
+class AcceptSettings:
+    """What a calibration is tested with.
 
     Args:
-        session: Session folder.
         artefact: TOML file with the values of the certificate, the captures that show the artefact, and the limits.
         model: Which calibration to test; by default the best one available.
         still: Captures (ten) of one still object, for the repeatability.
         apply_scale: Record the measured scale as a correction of later clouds.
+    """
+
+    artefact: Path | str
+    model: ModelName | None = None
+    still: Sequence[str] = ()
+    apply_scale: bool = False
+
+
+@operation("accept", AcceptanceTest, AcceptSettings)
+def accept(job: Job, settings: AcceptSettings) -> Iterator[Found[AcceptanceTest]]:
+    """Test a calibration with a ball bar, a sphere or a plane that has a certificate, against the operator's limits.
 
     The result stays in the session as ``acceptance/1``, ``acceptance/2``, ...
     """
-    certified = read_artefact(artefact)
-    with opened(session, write=True) as store:
-        check_accepted(store)
-        name = model or best_model(store)
-        chosen, factor = load_model(store, name), scale_factor(store, name)
-        warn_if_stale(store, warn)
-        if apply_scale and certified.kind == "plane":
-            raise InputError("the scale cannot be measured on a plane: apply that of a ball bar or a sphere")
-        captures = _match_captures(store, certified)
-        check_capture_sizes(store, [*captures, *still])
-        depth_range = load_stereo(store).depth_range_mm
-        measuring = part(progress, 0, 0.9 if not still else 0.5)
-        positions: list[Position] = []
-        for i, (shot, frames, phases) in enumerate(decode_captures(store, list(captures), warn)):
-            measuring(i / len(captures), f"measuring {shot.name}")
-            cloud = capture_cloud(store, chosen, shot, phases, warn=warn)
-            plate = None
-            if certified.kind == "plane" and shot.role == "calibration":
-                plate = segment_board(store, shot, capture_texture(shot, frames), warn)
-            try:
-                positions.append(measure_artefact(certified, cloud, captures[shot.name], shot.name, depth_range, plate))
-            except InputError as error:
-                raise InputError(f"{shot.name}: {error}") from error
-        test = conclude_test(certified, name, positions)
-        repeatability_mm = None
-        if still:
-            watching = part(progress, 0.5, 0.95)
+    store, still = job.store, settings.still
+    certified = read_artefact(settings.artefact)
+    check_accepted(store)
+    name = settings.model or best_model(store)
+    chosen, factor = load_model(store, name), scale_factor(store, name)
+    warn_if_stale(store, job.warn)
+    if settings.apply_scale and certified.kind == "plane":
+        raise InputError("the scale cannot be measured on a plane: apply that of a ball bar or a sphere")
+    captures = _match_captures(store, certified)
+    check_capture_sizes(store, [*captures, *still])
+    positions = _measure_positions(job, certified, chosen, captures, 0.5 if still else 0.9)
+    test = conclude_test(certified, name, positions)
+    repeated = None
+    if still:
+        repeated = repeatability(_list_depths(replace(job, progress=part(job.progress, 0.5, 0.95)), chosen, still))
+    checks = load_drift_history(store)
+    applied = record_scale(store, test) if settings.apply_scale else None
+    figures = to_plain(test) | {
+        "decision": test.decision,
+        "lacks": test.lacks,
+        "scale_factor": factor,
+        "scale_applied": applied,
+        "budget": to_plain(_length_budget(test, applied, checks)),
+        "repeatability": None if repeated is None else repeated.to_json(),
+        "time": datetime.now(UTC).isoformat(timespec="seconds"),
+        "inputs": store.input_hashes(f"calibration/{name}", *captures, *still),
+    }
+    yield Found(str(next_number(store, AcceptanceTest.kind)), from_plain(figures, AcceptanceTest))
+    job.progress(1.0, "tested")
 
-            def clouds() -> Any:
-                """Yield depth and its standard deviation (h, w) mm of each capture of the still object."""
-                for i, (shot, _, phases) in enumerate(decode_captures(store, list(still))):
-                    watching(i / len(still), f"repeating {shot.name}")
-                    cloud = capture_cloud(store, chosen, shot, phases, warn=warn)
-                    yield cloud.points[..., 2], cloud.sigma_z
 
-            repeatability_mm = repeatability(clouds())
-        checks = load_drift_history(store)
-        applied = record_scale(store, test) if apply_scale else None
-        result = AcceptanceResult(test, factor, applied, _length_budget(test, applied, checks), repeatability_mm)
-        meta = {
-            "accepted": result.to_json(),
-            "time": datetime.now(UTC).isoformat(timespec="seconds"),
-            "inputs": store.input_hashes(f"calibration/{name}", *captures, *still),
-        }
-        store.save_result(f"acceptance/{next_number(store, 'acceptance')}", meta, {})
-        progress(1.0, "tested")
-    return result
+def _measure_positions(
+    job: Job, certified: Artefact, chosen: Model, captures: Mapping[str, str], end: float
+) -> list[Position]:
+    """Measure the artefact at each position, {capture: position}; ``end``: share of the work that is done then."""
+    store, positions = job.store, list[Position]()
+    depth_range = load_stereo(store).depth_range_mm
+    for i, (shot, frames, phases) in enumerate(decode_captures(store, list(captures), job.warn)):
+        job.progress(end * i / len(captures), f"measuring {shot.name}")
+        cloud = capture_cloud(store, chosen, shot, phases, warn=job.warn)
+        plate = None
+        if certified.kind == "plane" and shot.role == "calibration":
+            plate = segment_board(store, shot, capture_texture(shot, frames), job.warn)
+        try:
+            positions.append(measure_artefact(certified, cloud, captures[shot.name], shot.name, depth_range, plate))
+        except InputError as error:
+            raise InputError(f"{shot.name}: {error}") from error
+    return positions
+
+
+def _list_depths(job: Job, chosen: Model, still: Sequence[str]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yield depth and its standard deviation (h, w) mm of each capture of the still object."""
+    for i, (shot, _, phases) in enumerate(decode_captures(job.store, list(still))):
+        job.progress(i / len(still), f"repeating {shot.name}")
+        cloud = capture_cloud(job.store, chosen, shot, phases, warn=job.warn)
+        yield cloud.points[..., 2], cloud.sigma_z
 
 
 def read_artefact(path: Path | str) -> Artefact:
@@ -172,7 +155,7 @@ def _length_budget(test: Acceptance, applied: float | None, checks: Sequence[Dri
         since = f"the drift check of {last.capture}"
     return ErrorBudget(
         mm,
-        (
+        [
             Contribution("phase noise", noise, "A", "the scatter of the points about their fits"),
             Contribution("calibration", scatter, "A", f"the errors' scatter over {len(errors)} places"),
             Contribution(
@@ -183,5 +166,5 @@ def _length_budget(test: Acceptance, applied: float | None, checks: Sequence[Dri
             ),
             Contribution("temperature", warmth, "B", f"{artefact.expansion.ppm_per_kelvin:g} ppm/K of the artefact"),
             Contribution("drift", drift, "B", since),
-        ),
+        ],
     )

@@ -28,7 +28,7 @@ from slviewer.pipeline.models import (
     preferred_model,
     recommended_model,
 )
-from slviewer.pipeline.open_session import SessionLike, numbered_results, opened
+from slviewer.pipeline.open_session import SessionLike, opened
 from slviewer.pipeline.poses import load_observations
 from slviewer.pipeline.scale import describe_scale
 from slviewer.pipeline.stored_records import list_records
@@ -36,7 +36,6 @@ from slviewer.records.kinds import RECORDS
 from slviewer.records.plain import from_plain
 from slviewer.records.verification import Verification
 from slviewer.report.data import (
-    AcceptanceView,
     CalibrationFigures,
     CaptureRow,
     ModelsView,
@@ -115,7 +114,6 @@ def _collect_data(store: Session) -> SessionData:
         verdict=verdict,
         verdict_of_calibration=verdict is not None and judged is not None and from_plain(judged, Verdict) == verdict,
         models=_load_models(store),
-        acceptances=_list_acceptances(store),
         region="" if region is None else region.text(),
         edits=[(scan, words) for scan in store.capture_names("scan") for words in list_edits(store, scan)[0]],
         **measured_views(store),
@@ -136,15 +134,6 @@ def _load_models(store: Session) -> ModelsView | None:
         splined=None if splined is None else splined.summary(),
         scales={name: words for name in there if (words := describe_scale(store, name))},
     )
-
-
-def _list_acceptances(store: Session) -> list[AcceptanceView]:
-    """Return the session's acceptance tests with their times, and whether each is stale."""
-    views = []
-    for name in numbered_results(store, "acceptance"):
-        meta = store.load_result(name, only=())[0]
-        views.append(AcceptanceView(meta["accepted"], meta["time"], store.state_of(name) == "stale"))
-    return views
 
 
 def _collect_records(store: Session) -> tuple[list[RecordsView], list[str]]:

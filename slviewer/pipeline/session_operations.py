@@ -1,6 +1,5 @@
 """A session whose methods are the operations: what `slviewer.Session` is."""
 
-from slviewer.pipeline.accept import accept
 from slviewer.pipeline.calibrate import calibrate
 from slviewer.pipeline.compare import compare
 from slviewer.pipeline.edit import edit_scan, set_region
@@ -8,7 +7,7 @@ from slviewer.pipeline.export import export
 from slviewer.pipeline.inspect import inspect
 from slviewer.pipeline.measure import measure
 from slviewer.pipeline.mesh import mesh
-from slviewer.pipeline.operations import align, check, merge, reconstruct, verify
+from slviewer.pipeline.operations import accept, align, check, merge, reconstruct, verify
 from slviewer.pipeline.plan import plan
 from slviewer.pipeline.report import report
 from slviewer.pipeline.stored_records import load_arrays
@@ -27,7 +26,7 @@ class SessionOperations(Session):
             session.reconstruct("object").only.points
     """
 
-    accept = accept
+    accept = accept.accept
     align = align.align
     calibrate = calibrate
     check = check.check

@@ -214,15 +214,6 @@ class ModelsView:
 
 
 @dataclass(frozen=True, eq=False)
-class AcceptanceView:
-    """One acceptance test: ``found`` as ``accept --json`` gives it, ``time`` ISO 8601, UTC."""
-
-    found: Mapping[str, Any]
-    time: str
-    stale: bool = False
-
-
-@dataclass(frozen=True, eq=False)
 class SessionData:
     """A session's captures, its calibrations, and the measurements made with them.
 
@@ -240,7 +231,6 @@ class SessionData:
     verdict: Verdict | None = None
     verdict_of_calibration: bool = True
     models: ModelsView | None = None
-    acceptances: Sequence[AcceptanceView] = ()
     measurements: Sequence[Measurement] = ()  # but deviations
     sections: Sequence[tuple[str, Sequence[np.ndarray]]] = ()
     deviations: Sequence[tuple[Measurement, Mapping[str, np.ndarray]]] = ()

@@ -1,14 +1,13 @@
 """Sections on the quality of a calibration: verdict, comparison of models, acceptance tests."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 from slviewer.calibration.diagnosis.verdict import Verdict
 from slviewer.evaluation.crossvalidation import CrossValidation
 from slviewer.records.table import Cell, Column, Mark, Table
-from slviewer.report.data import AcceptanceView, ModelsView
+from slviewer.report.data import ModelsView
 from slviewer.report.page import Headline, Item, PageNotice, Section
-from slviewer.report.tables import UNKNOWN, format_number
 
 _LEVELS: dict[str, tuple[str, str]] = {
     "good": ("Good: no problems detected.", "good"),
@@ -105,87 +104,3 @@ def splined_table(summary: Mapping[str, Any]) -> Table:
     ]
     columns = [Column("quantity", align="left"), Column("value")]
     return Table(columns, rows, "Joint adjustment (splined)", ["Pixels outside the calibrated region are masked."])
-
-
-def acceptance_section(acceptances: Sequence[AcceptanceView]) -> Section:
-    """The section with every acceptance test: decisions, scale, budget, repeatability; the last one first."""
-    items: list[Item] = []
-    for view in reversed(acceptances):
-        items += _acceptance_items(view)
-    text = (
-        "Artefacts with known lengths, measured in several places. A property passes where its error and the test's "
-        "own uncertainty together stay within the limit, fails where the error exceeds it by more than that, "
-        "and is undecided between. These tests follow the ideas of VDI/VDE 2634 part 2 and ISO 10360-13, and claim "
-        "conformity with neither."
-    )
-    return Section("Acceptance", text, items)
-
-
-def _acceptance_items(view: AcceptanceView) -> list[Item]:
-    """Verdict, tables and notices of one acceptance test."""
-    result = view.found
-    artefact = result["artefact"]
-    named = (
-        f"{artefact['name']}, certificate {artefact['certificate']}, measured by {result['model']} on {view.time[:10]}"
-    )
-    decided, _ = _DECISIONS[result["decision"]]
-    items: list[Item] = [
-        PageNotice(f"{named}: {decided.upper() if result['decision'] else decided}.",
-               "good" if result["decision"] == "pass" else "plain" if result["decision"] is None else "warning")
-    ]  # fmt: skip
-    if view.stale:
-        items.append(PageNotice("The calibration or the captures have changed since this test: test again."))
-    items += [PageNotice(f"Incomplete: {what}.") for what in result["lacks"]]
-    rows: list[list[str | Cell]] = []
-    for each in result["judgements"]:
-        worst, limit = each["worst"], each["limit_mm"]
-        rows.append(
-            [
-                each["property"],
-                format_number(worst["error_mm"], 4, signed=True),
-                worst["position"],
-                format_number(worst["U_mm"], 4),
-                " ... ".join(f"{v:+.4f}".replace("-", "−") for v in worst["within_95_mm"]),
-                UNKNOWN if limit is None else f"{limit:g}",
-                Cell(*_DECISIONS[each["decision"]]),
-            ]
-        )
-    columns = [Column("property", align="left"), Column("worst", "mm"), Column("at", align="left")]
-    columns += [Column("uncertainty U, k = 2", "mm"), Column("95 % lie within", "mm", align="centre")]
-    columns += [Column("limit", "mm"), Column("decision", align="left")]
-    notes = [f"{len(result['positions'])} positions."]
-    if scale := result["scale"]:
-        U = 2 * scale["u_ppm"]
-        notes.append(
-            f"Scale: {scale['ppm']:+.0f} ppm ± {U:.0f} ppm (k = 2) over {scale['length_mm']:.3f} mm.".replace("-", "−")
-        )
-    if result["scale_applied"] is not None:
-        ppm = f"{1e6 * (result['scale_applied'] - 1):+.0f}".replace("-", "−")
-        notes.append(f"The scale was corrected by {ppm} ppm from this test on.")
-    elif result["scale_factor"] != 1:
-        ppm = f"{1e6 * (result['scale_factor'] - 1):+.0f}".replace("-", "−")
-        notes.append(f"A scale correction of {ppm} ppm was in force during the test.")
-    if steady := result["repeatability"]:
-        notes.append(
-            f"Repeatability over {steady['captures']} captures of a still object: {steady['sigma_mm']:.4f} mm (median "
-            f"over the pixels), {steady['predicted_mm']:.4f} mm expected from noise; the mean depth drifted by "
-            f"{steady['wandering_mm']:.4f} mm. This is not a measure of accuracy."
-        )
-    items.append(Table(columns, rows, artefact["name"], notes))
-    if result["budget"]:
-        items.append(_budget_table(result["budget"]))
-    return items
-
-
-def _budget_table(budget: Mapping[str, Any]) -> Table:
-    """Table of the uncertainty budget: contributions in mm, and the expanded uncertainty below."""
-    rows: list[list[str | Cell]] = [
-        [c["source"], UNKNOWN if c["u_mm"] is None else f"{c['u_mm']:.4f}", c["kind"], c["how"]]
-        for c in budget["contributions"]
-    ]
-    columns = [Column("source", align="left"), Column("standard uncertainty", "mm"), Column("type", align="centre")]
-    columns.append(Column("from", align="left"))
-    without = f" Unknown: {' and '.join(budget['unknown'])}; U excludes it." if budget["unknown"] else ""
-    notes = [f"Type A: from repeated observations; B: from anything else.{without}"]
-    footer = [["expanded, k = 2", f"{budget['U_mm']:.4f}", "", ""]]
-    return Table(columns, rows, f"Uncertainty of a length of {budget['length_mm']:.0f} mm", notes, footer)

@@ -16,7 +16,6 @@ from slviewer.report.maps import rms_maps
 from slviewer.report.measurements import deviations_section, measurements_section
 from slviewer.report.page import Headline, Item, PageNotice, Section
 from slviewer.report.quality import (
-    acceptance_section,
     models_section,
     verdict_headline,
     verdict_section,
@@ -100,8 +99,6 @@ def session_sections(data: SessionData) -> list[Section]:
     if data.pixel_fits:
         sections.append(_pixel_fits_section(data))
     sections += [_records_section(view) for view in data.records]
-    if data.acceptances:
-        sections.append(acceptance_section(data.acceptances))
     if data.measurements or data.sections:
         sections.append(measurements_section(data.measurements, data.sections))
     if data.deviations:

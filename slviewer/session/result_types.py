@@ -176,13 +176,6 @@ class _Inspection(ResultMeta, total=False):
     parts: Required[list[dict[str, Any]]]
 
 
-class _Acceptance(ResultMeta, total=False):
-    """`acceptance/*`."""
-
-    accepted: dict[str, Any]
-    time: str
-
-
 class _Scale(ResultMeta, total=False):
     """`scale/*`."""
 
@@ -204,7 +197,6 @@ _TYPES: dict[str, Any] = {
     "edits": _Edits,
     "measurements": _Measurement,
     "inspection": _Inspection,
-    "acceptance": _Acceptance,
     "scale": _Scale,
 }
 

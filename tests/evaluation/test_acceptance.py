@@ -13,10 +13,9 @@ from facts import missing_facts, raises
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import InputError
 from slviewer.evaluation.acceptance.artefact import Artefact, Limits
-from slviewer.evaluation.acceptance.figures import AcceptanceFigure, decide, narrowest_range
+from slviewer.evaluation.acceptance.figures import K_95, AcceptanceFigure, decide, narrowest_range
 from slviewer.evaluation.acceptance.measure import FLATNESS, FORM, SIZE, SPACING, measure_artefact
-from slviewer.evaluation.acceptance.result import CLAIM, conclude_test
-from slviewer.evaluation.budget import Contribution, ErrorBudget
+from slviewer.evaluation.acceptance.result import conclude_test
 from slviewer.evaluation.repeatability import repeatability
 from slviewer.fringe.decode import decode
 from slviewer.fringe.presets import p18
@@ -24,6 +23,8 @@ from slviewer.fringe.sequence import one_axis
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.rig import StereoRig
 from slviewer.reconstruction.reconstruct import reconstruct_cloud
+from slviewer.records.acceptance import Contribution, ErrorBudget
+from slviewer.records.table import render_text
 from slviewer.simulation.boards import Pose, blank_board
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import letter
@@ -113,7 +114,7 @@ def test_a_scale_error_of_200_ppm_is_found(bars, true_test):
     wrong = outcome(Artefact.from_dict(GIVEN), bars, true_model(200e-6))
     assert wrong.scale.ppm == pytest.approx(200, abs=wrong.scale.U_ppm)
     assert wrong.scale.ppm - true_test.scale.ppm == pytest.approx(200, abs=3)
-    low, high = wrong.scale.to_json()["within_95_ppm"]
+    low, high = wrong.scale.within(K_95)
     assert low < 200 < high and wrong.scale.U_ppm < 150
 
 
@@ -124,7 +125,7 @@ def test_temperature_is_corrected(bars):
     cold, hot = (outcome(Artefact.from_dict(given), bars[:2], true_model()) for given in (GIVEN, warm))
     assert cold.scale.ppm - hot.scale.ppm == pytest.approx(115, abs=0.5)
     assert hot.positions[0].error(SPACING).U_mm > cold.positions[0].error(SPACING).U_mm
-    assert hot.lacks and missing_facts(hot.text(), "2 of 7") == []
+    assert missing_facts("; ".join(hot.lacks), "2 of 7") == []
 
 
 @pytest.mark.computes
@@ -138,7 +139,6 @@ def test_decisions_heed_the_tests_own_uncertainty(true_test, limit, decision):
     assert decide([AcceptanceFigure.of_length(SPACING, "", error, u) for error in errors], limit) == decision
     judged = conclude_test(replace(unsure, limits=Limits(spacing_mm=limit)), "stereo", true_test.positions)
     assert judged.decision in ("pass", "fail", "undecided")
-    assert missing_facts(judged.text(), judged.decision.upper(), CLAIM) == []
 
 
 @pytest.mark.slow
@@ -219,5 +219,5 @@ def test_a_budget_adds_squares_and_names_what_is_unknown():
         100.0,
         [Contribution("a", 0.003, "A", ""), Contribution("b", 0.004, "B", ""), Contribution("drift", None, "B", "")],
     )
-    assert found.U_mm == pytest.approx(0.010) and found.unknown == ("drift",)
-    assert missing_facts(found.text(), "without", *found.unknown) == []
+    assert found.U_mm == pytest.approx(0.010) and found.unknown == ["drift"]
+    assert missing_facts(render_text(found.table()), "excludes", *found.unknown) == []

@@ -12,10 +12,12 @@ from made_up import MODELS, plane_rows, reproduction_data, session_data, sphere_
 from slviewer.calibration.diagnosis.verdict import Finding, Verdict
 from slviewer.calibration.stereo import StereoModel
 from slviewer.evaluation.crossvalidation import CrossValidation, HeldOutPose
+from slviewer.pipeline.stored_records import read_record
+from slviewer.records.acceptance import AcceptanceTest
 from slviewer.records.drift import Drift
 from slviewer.records.table import Cell, Table
 from slviewer.records.verification import ModelFit, Verification
-from slviewer.report.data import AcceptanceView, CalibrationFigures, ModelsView, PlaneRow, RecordsView, SpacingRow
+from slviewer.report.data import CalibrationFigures, ModelsView, PlaneRow, RecordsView, SpacingRow
 from slviewer.report.page import Figure, PageNotice, Section, write_page
 from slviewer.report.reproduction import (
     inside_ratio,
@@ -222,18 +224,28 @@ def test_how_good_a_calibration_is() -> None:
         "cells_lit": {"camera": 0.98, "projector": 0.6},
         "left_out": {"pose_09": "contradicts the other poses"},
     }
-    figure = {"error_mm": -0.03, "U_mm": 0.004, "position": "left", "within_95_mm": (-0.034, -0.026)}
+    sides = {"within_95_mm": (-0.034, -0.026), "within_997_mm": (-0.036, -0.024)}
+    figure = {"property": "sphere spacing", "error_mm": -0.03, "U_mm": 0.004, "position": "left", **sides}
     found = {
         "artefact": {"name": "bar <1>", "certificate": "lab 7"},
         "model": "splined",
-        "positions": [1, 2],
+        "positions": [
+            {"position": "left", "capture": "a", "figures": [figure], "rms_mm": [0.1], "floor_mm": [0.1], "points": 9},
+        ],
         "judgements": [{"property": "sphere spacing", "worst": figure, "limit_mm": 0.05, "decision": "undecided"}],
-        "scale": {"ppm": -300.0, "u_ppm": 20.0, "length_mm": 100.0},
+        "scale": {"ppm": -300.0, "u_ppm": 20.0, "length_mm": 100.0, "positions": 2},
         "decision": "undecided",
         "lacks": ["2 of 7 positions were measured"],
         "scale_factor": 1.0,
         "scale_applied": 1.0003,
-        "repeatability": {"captures": 10, "sigma_mm": 0.02, "predicted_mm": 0.021, "wandering_mm": 0.001},
+        "repeatability": {
+            "captures": 10,
+            "pixels": 9,
+            "sigma_mm": 0.02,
+            "sigma_95_mm": 0.03,
+            "predicted_mm": 0.021,
+            "wandering_mm": 0.001,
+        },
         "budget": {
             "length_mm": 100.0,
             "U_mm": 0.03,
@@ -259,8 +271,11 @@ def test_how_good_a_calibration_is() -> None:
         session_data(WIDTH),
         verdict=verdict,
         models=ModelsView("stereo", "splined", compared, splined, {"splined": "scale corrected by +300 ppm"}),
-        acceptances=[AcceptanceView(found, "2026-11-21T10:00:00+00:00")],
-        records=[RecordsView(Drift, {"1": drift}), RecordsView(Verification, balls)],
+        records=[
+            RecordsView(AcceptanceTest, {"1": read_record(AcceptanceTest, {"accepted": found, "time": "2026-11-21"})}),
+            RecordsView(Drift, {"1": drift}),
+            RecordsView(Verification, balls),
+        ],
     )
     assert session_headlines(data)[0].value == "doubtful"
     words = "\n".join(texts(section) for section in session_sections(data))

@@ -14,10 +14,6 @@ import numpy as np
 
 Decision = Literal["pass", "fail", "undecided"]
 K_95, K_997 = 1.96, 2.97
-RULE = (
-    "decided with a guard band as in ISO 14253-1: pass if error and expanded uncertainty (k = 2) together stay within "
-    "the limit at every position, fail if the error exceeds it by more than the uncertainty at one, else undecided"
-)
 
 
 def narrowest_range(deviations: np.ndarray, share: float) -> float:

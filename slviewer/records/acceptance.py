@@ -1,0 +1,247 @@
+"""Tests of a calibration with certified artefacts, against the operator's limits."""
+
+from collections.abc import Mapping
+from math import hypot
+from typing import Any, ClassVar, Literal
+
+import msgspec
+
+from slviewer.records.record import Record
+from slviewer.records.table import Cell, Column, Mark, Table, Value
+from slviewer.records.verification import Count
+
+Decision = Literal["pass", "fail", "undecided"]
+Interval = tuple[float, float]
+COVERAGE = 2.0
+RULE = (
+    "Decided with a guard band as in ISO 14253-1: pass if error and expanded uncertainty (k = 2) "
+    "together stay within the limit at every position, fail if the error exceeds it by more than the "
+    "uncertainty at one, else undecided. The test follows the ideas of VDI/VDE 2634 part 2 and "
+    "ISO 10360-13, and claims conformity with neither."
+)
+MARKS: Mapping[str, Mark] = {"pass": "better", "fail": "worse", "undecided": "strong"}
+
+
+class PropertyError(msgspec.Struct, frozen=True):
+    """The error of a property at one position, with the test's expanded uncertainty (k = 2), and where the error lies
+    with 95 and 99.7 % probability; of form and flatness the ranges that hold as many points."""
+
+    property: str
+    position: str
+    error_mm: float
+    U_mm: float
+    within_95_mm: Interval
+    within_997_mm: Interval
+
+
+class JudgedProperty(msgspec.Struct, frozen=True):
+    """One property over all positions: the ``worst`` error, the limit, and the decision (None without a limit)."""
+
+    property: str
+    worst: PropertyError
+    limit_mm: float | None
+    decision: Decision | None
+
+
+class PositionErrors(msgspec.Struct, frozen=True):
+    """What was measured at one position: ``rms_mm`` and ``floor_mm`` of each ball or the plane."""
+
+    position: str
+    capture: str
+    figures: list[PropertyError]
+    rms_mm: list[float]
+    floor_mm: list[float]
+    points: Count
+    incidence: dict[str, float] | None = None
+    warnings: list[str] = []
+
+
+class ScaleError(msgspec.Struct, frozen=True):
+    """Relative error of the scale, positive where the instrument measures too long, from so many positions."""
+
+    ppm: float
+    u_ppm: float
+    length_mm: float
+    positions: Count
+
+
+class Contribution(msgspec.Struct, frozen=True):
+    """One source of a length's uncertainty: its standard uncertainty, None where nothing is known of it. ``kind`` A:
+    from repeated observations; B: from anything else."""
+
+    source: str
+    u_mm: float | None
+    kind: str
+    how: str
+
+
+class ErrorBudget(msgspec.Struct, frozen=True):
+    """The contributions to the uncertainty of a length, in the manner of the GUM."""
+
+    length_mm: float
+    contributions: list[Contribution]
+
+    @property
+    def U_mm(self) -> float:
+        """Expanded uncertainty (k = 2) of all known contributions."""
+        return COVERAGE * hypot(*(each.u_mm for each in self.contributions if each.u_mm is not None))
+
+    @property
+    def unknown(self) -> list[str]:
+        """Sources of unknown uncertainty, which U does not include."""
+        return [each.source for each in self.contributions if each.u_mm is None]
+
+    def table(self) -> Table:
+        """Return the contributions, and the expanded uncertainty below."""
+        columns = [
+            Column("source", align="left"),
+            Column("standard uncertainty", "mm", digits=4),
+            Column("type", align="centre"),
+            Column("from", align="left", detail=True),
+        ]
+        without = f" Unknown: {' and '.join(self.unknown)}; U excludes it." if self.unknown else ""
+        notes = [f"Type A: from repeated observations; B: from anything else.{without}"]
+        rows = [[each.source, each.u_mm, each.kind, each.how] for each in self.contributions]
+        caption = f"Uncertainty of a length of {self.length_mm:.0f} mm"
+        return Table(columns, rows, caption, notes, [["expanded, k = 2", self.U_mm, "", ""]])
+
+
+class StillCaptures(msgspec.Struct, frozen=True):
+    """The spread of depth over captures of a still object: medians over the pixels, and what noise predicts;
+    ``wandering_mm``: how far the mean depth moved."""
+
+    captures: Count
+    pixels: Count
+    sigma_mm: float
+    sigma_95_mm: float
+    predicted_mm: float
+    wandering_mm: float
+
+
+class CertifiedArtefact(msgspec.Struct, frozen=True):
+    """The artefact of a test, and its certificate."""
+
+    name: str
+    certificate: str
+    kind: str = ""
+
+
+class AcceptanceTest(Record, frozen=True, kw_only=True):
+    """Artefacts with known lengths, measured in several places.
+
+    ``lacks``: what the positions do not test; ``scale_factor``: the correction in force during the test,
+    ``scale_applied`` the one that it put in force; ``time``: ISO 8601, UTC.
+    """
+
+    kind: ClassVar[str] = "acceptance"
+    title: ClassVar[str] = "Acceptance"
+    is_history: ClassVar[bool] = True
+    artefact: CertifiedArtefact
+    model: str
+    positions: list[PositionErrors]
+    judgements: list[JudgedProperty]
+    scale: ScaleError | None = None
+    decision: Decision | None = None
+    lacks: list[str] = []
+    scale_factor: float = 1.0
+    scale_applied: float | None = None
+    budget: ErrorBudget | None = None
+    repeatability: StillCaptures | None = None
+    time: str = ""
+
+    @classmethod
+    def upgrade(cls, meta: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Convert a record of version 0.2, whose figures were one entry."""
+        old = meta.get("accepted")
+        return (
+            {**old, "time": meta.get("time", ""), "inputs": meta.get("inputs", {})} if isinstance(old, dict) else meta
+        )
+
+    @property
+    def is_good(self) -> bool:
+        """Whether no property fails or is undecided, and nothing is left untested."""
+        return self.decision in ("pass", None) and not self.lacks
+
+    def summary(self) -> str:
+        """Return artefact, decision and what is missing in one sentence."""
+        missing = f"; incomplete: {'; '.join(self.lacks)}" if self.lacks else ""
+        return (
+            f"{self.artefact.name}, certificate {self.artefact.certificate}, measured by {self.model} on "
+            f"{self.time[:10]}: {(self.decision or 'not decided').upper()}{missing}"
+        )
+
+    def figures(self) -> dict[str, float]:
+        """Return none: repeated, the test would find a scale that was corrected since."""
+        return {}
+
+    @classmethod
+    def tables(cls, found: Mapping[str, "AcceptanceTest"]) -> list[Table]:  # type: ignore[override]
+        """Return, for each test, the properties, the positions, and the budget of a length; the last test first."""
+        return [table for name, each in reversed(list(found.items())) for table in each._list_tables(name)]
+
+    def _list_tables(self, name: str) -> list[Table]:
+        columns = [
+            Column("property", align="left"),
+            Column("worst", "mm", digits=4),
+            Column("at", align="left", detail=True),
+            Column("uncertainty U, k = 2", "mm", digits=4),
+            *(Column(end, "mm", "95 % lie", digits=4, detail=True) for end in ("from", "to")),
+            Column("limit", "mm"),
+            Column("decision", align="left"),
+        ]
+        rows: list[list[Value | Cell]] = [
+            [
+                each.property,
+                each.worst.error_mm,
+                each.worst.position,
+                each.worst.U_mm,
+                *each.worst.within_95_mm,
+                each.limit_mm,
+                Cell(each.decision or "no limit", MARKS.get(each.decision or "", "")),
+            ]
+            for each in self.judgements
+        ]
+        tables = [
+            Table(columns, rows, f"Test {name}: {self.artefact.name}", self._list_notes()),
+            self._list_positions(),
+        ]
+        return tables if self.budget is None else [*tables, self.budget.table()]
+
+    def _list_positions(self) -> Table:
+        shown = [each.property for each in self.judgements]
+        columns = [
+            Column("position", align="left"),
+            *(Column(name, "mm", digits=4) for name in shown),
+            Column("RMS", "mm"),
+            Column("noise floor", "mm"),
+            *(Column(depths, "%", "share in", digits=0, detail=True) for depths in ("R1", "R2", "R3")),
+            Column("points", detail=True),
+        ]
+        rows: list[list[Value | Cell]] = []
+        for each in self.positions:
+            worst = {f.property: f.error_mm for f in sorted(each.figures, key=lambda f: abs(f.error_mm))}
+            shares = [(each.incidence or {}).get(depths) for depths in ("R1", "R2", "R3")]
+            errors = [worst.get(name) for name in shown]
+            rows.append([each.position, *errors, max(each.rms_mm), max(each.floor_mm), *shares, each.points])
+        notes = [f"{each.position}: {warning}" for each in self.positions for warning in each.warnings]
+        return Table(columns, rows, "The worst error of each property at each position", notes).without_empty()
+
+    def _list_notes(self) -> list[str]:
+        notes = [f"{self.summary()}.", f"{len(self.positions)} positions.", RULE]
+        if self.scale is not None:
+            scale, U = self.scale, COVERAGE * self.scale.u_ppm
+            notes.append(f"Scale: {scale.ppm:+.0f} ppm ± {U:.0f} ppm (k = 2) over {scale.length_mm:.3f} mm.")
+        if self.scale_applied is not None:
+            notes.append(f"The scale was corrected by {1e6 * (self.scale_applied - 1):+.0f} ppm from this test on.")
+        elif self.scale_factor != 1:
+            ppm = f"{1e6 * (self.scale_factor - 1):+.0f}"
+            notes.append(f"A scale correction of {ppm} ppm was in force during the test.")
+        if self.scale is not None and self.scale_applied is None:
+            notes.append("The scale was not corrected: --apply-scale does so.")
+        if (still := self.repeatability) is not None:
+            notes.append(
+                f"Repeatability over {still.captures} captures of a still object: {still.sigma_mm:.4f} mm (median over "
+                f"{still.pixels:,} pixels; 95 % below {still.sigma_95_mm:.4f}), {still.predicted_mm:.4f} mm expected "
+                f"from noise; the mean depth drifted by {still.wandering_mm:.4f} mm. This is no measure of accuracy."
+            )
+        return [note.replace(" -", " −").replace("−-apply", "--apply") for note in notes]
