@@ -27,25 +27,31 @@ from slviewer.commands.wizard import wizard
 from slviewer.errors import Cancelled, SlviewerError
 
 
-def describe_measurement(made: Any, **_: Any) -> str:
+def _describe_measurement(made: Any, **_: Any) -> str:
     """Describe a measurement in one line."""
     from slviewer.pipeline import measurements
 
     return measurements.describe_measurement(made)
 
 
-def describe_simulation(names: list[str], session: Path, **_: Any) -> str:
+def _describe_simulation(names: list[str], session: Path, **_: Any) -> str:
     """Describe how many captures were simulated, and the next command."""
     from slviewer.pipeline.simulate import TARGET
 
     return f"{len(names)} captures simulated into {session}; next: slviewer calibrate {session} --target {TARGET}"
 
 
-def describe_dataset(fetched: Path, **_: Any) -> str:
+def _describe_dataset(fetched: Path, **_: Any) -> str:
     """Describe where a data set is."""
     return f"images in {fetched}"
 
 
+CONFIG = (
+    tyro.conf.OmitArgPrefixes,
+    tyro.conf.OmitSubcommandPrefixes,
+    tyro.conf.FlagCreatePairsOff,
+    tyro.conf.PositionalMetavarFromFieldName,
+)
 DESCRIPTION = "Structured-light 3D scanning: calibrate a camera and a projector, prove it, scan, merge."
 
 
@@ -97,7 +103,7 @@ COMMANDS = Commands(
         ),
         "validate": partial(read_command, "pipeline.validate:validate", "session", options=[JSON]),
         "decode": partial(
-            read_command, "pipeline.decode:decode", "session", "capture", names={"file_format": "format"}
+            read_command, "pipeline.decode:write_decoded", "session", "capture", names={"file_format": "format"}
         ),
         "reconstruct": partial(read_command, "pipeline.reconstruct:reconstruct", "session", "capture"),
         "region": partial(read_command, "pipeline.edit:set_region", "session"),
@@ -122,7 +128,7 @@ COMMANDS = Commands(
             "session",
             "scan",
             "what",
-            run=partial(show_result, describe=describe_measurement),
+            run=partial(show_result, describe=_describe_measurement),
         ),
         "measurements": partial(read_command, "pipeline.measure:edit_measurements", "session"),
         "plan": partial(read_command, "pipeline.plan:plan", "session"),
@@ -152,13 +158,13 @@ COMMANDS = Commands(
             "pipeline.datasets:fetch",
             "name",
             "folder",
-            run=partial(show_result, describe=describe_dataset),
+            run=partial(show_result, describe=_describe_dataset),
         ),
         "simulate": partial(
             read_command,
             "pipeline.simulate:simulate",
             "session",
-            run=partial(show_result, describe=describe_simulation),
+            run=partial(show_result, describe=_describe_simulation),
         ),
         "reproduce": partial(read_command, "validation.reproduce:reproduce", options=[JSON]),
         "prove": partial(read_command, "validation.prove:prove", options=[JSON], names={"cases": "case"}),
@@ -187,33 +193,22 @@ def main(arguments: list[str] | None = None) -> int:
     if arguments == ["--version"]:
         print(f"slviewer {__version__}")
         return 0
-    name = arguments[0]
+    name, *rest = arguments
     try:
-        run = tyro.cli(
-            COMMANDS[name] if name in COMMANDS else union(COMMANDS),
-            prog=f"slviewer {name}" if name in COMMANDS else "slviewer",
-            description=None if name in COMMANDS else DESCRIPTION,
-            args=arguments[1:] if name in COMMANDS else arguments,
-            config=(
-                tyro.conf.OmitArgPrefixes,
-                tyro.conf.OmitSubcommandPrefixes,
-                tyro.conf.FlagCreatePairsOff,
-                tyro.conf.PositionalMetavarFromFieldName,
-            ),
-        )
+        if name in COMMANDS:
+            run = tyro.cli(COMMANDS[name], prog=f"slviewer {name}", args=rest, config=CONFIG)
+        else:
+            run = tyro.cli(union(COMMANDS), prog="slviewer", description=DESCRIPTION, args=arguments, config=CONFIG)
+        run()
     except SystemExit as stop:
         return int(stop.code or 0)
-    except BrokenPipeError:  # the help is piped into `head`
-        return 1
-    try:
-        run()
     except SlviewerError as error:
         terminal.print_message(f"slviewer: {error}")
         return error.exit_status
     except KeyboardInterrupt:
         terminal.print_message("slviewer: cancelled")
         return Cancelled.exit_status
-    except BrokenPipeError:
+    except BrokenPipeError:  # the help, or a result, is piped into `head`
         return 1
     except (MemoryError, RecursionError) as error:
         reason = "needs more memory than there is" if isinstance(error, MemoryError) else "nests values too deep"

@@ -107,7 +107,7 @@ def axis_figures(phase: PhaseMap) -> dict[str, Any]:
     return figures | dict(zip(names, values, strict=True))
 
 
-def decode(
+def write_decoded(
     session: SessionLike,
     capture: str,
     out: Path | str,

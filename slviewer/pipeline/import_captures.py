@@ -128,12 +128,14 @@ def find_captures(
             f"the layout {layout!r} is unknown: use {', '.join(known)}{LAYOUT_PLUGINS.explain_missing(layout)}"
         )
     size = known[layout].projector if projector is None else parse_size(projector)
+    assumed = None
     if layout == "frames":
         toml = sequence or find_description(source)
         if toml is None:
             raise InputError(f"{source} holds no TOML that describes the images: add one, or give --sequence")
         options["toml"] = Path(toml)
-    assumed = _known_projector_size(session) if size is None and session is not None and layout != "frames" else None
+    elif size is None and session is not None:
+        assumed = _known_projector_size(session)
     try:
         imports = known[layout].read(source, prefix=prefix, projector=size or assumed, **options)
     except InputError:
