@@ -71,7 +71,7 @@ RANGES: dict[str, tuple[float, float]] = {
     "wait_s": (1, LARGEST),
 }
 """Of the numbers that a command takes, by its parameter, where they are narrower."""
-JSON = Option("json", Path | None, None, "Write the result to this file too.")
+JSON = (Option("json", Path | None, None, "Write the result to this file too."),)
 
 
 def read_command(
