@@ -64,8 +64,9 @@ def import_captures(
         strict: Import nothing where one capture cannot be used, instead of skipping it with a warning.
 
     ``layout`` is one of `layouts.layouts()`, or "detect": the one that the file names show. Captures are named after
-    their folders. ``sequence`` is the TOML of the layout frames, by default the one in ``source``. ``origin`` is
-    recorded as where the captures come from, by default their folders. ``options`` are those of the layout's `read`.
+    their folders. ``sequence`` is the TOML of the layout frames, by default the one in ``source``; where Gray code 0
+    begins is estimated from the images if it does not state that. ``origin`` is recorded as where the captures come
+    from, by default their folders. ``options`` are those of the layout's `read`.
 
     Captures that cannot be read or decoded are skipped, and ``warn`` is called with the reason. Raises InputError where
     none is left, or, with ``strict``, for the first of them; nothing is saved then. Captures that are there already,
@@ -82,7 +83,64 @@ def import_captures(
         warn=warn,
         **options,
     )
-    return _save_captures(imports, session, role, origin, force, strict, progress, warn)
+    for message in imports.warnings:
+        warn(message)
+    skipped = list(imports.skipped)
+    if strict and skipped:
+        raise InputError(str(skipped[0]))
+
+    stated: set[str] = set()
+    names: list[str] = []
+    unchanged: list[str] = []
+    damaged: set[str] = set()
+
+    def warn_once(message: str) -> None:
+        """Issue a warning unless the same message was issued before."""
+        if message not in stated:
+            stated.add(message)
+            warn(message)
+
+    def read() -> Iterator[NewCapture]:
+        """Yield the checked captures one by one; one that cannot be used is a warning, or raises with ``strict``."""
+        for i, recording in enumerate(imports.recordings):
+            progress(i / len(imports), f"reading {recording.name}")
+            try:
+                capture = recording.read()
+                checked_capture = check_imported_capture(
+                    replace(capture, frames=capture.merged_frames(), exposures_ms=()), warn
+                )
+            except InputError as error:
+                if strict:
+                    raise
+                skipped.append(Skipped(recording.name, str(error)))
+                continue
+            for message in _list_assumptions(recording, capture):
+                warn_once(message)
+            names.append(capture.name)
+            capture = replace(capture, sequence=checked_capture.sequence, source=origin or capture.source)
+            comparison = store.compare_capture(capture, role)
+            if comparison == "same":
+                unchanged.append(capture.name)
+                continue
+            if comparison == "damaged":
+                warn(f"{capture.name}: its stored frames are damaged: the capture is replaced, and now in the trash")
+                damaged.add(capture.name)
+            yield capture
+        if len(skipped) == len(imports.skipped) + len(imports.recordings):
+            raise none_usable(skipped)
+
+    with opened_or_made(session) as store:
+        store.save_captures(read(), role, force=force or damaged)
+        for each in skipped:
+            warn(f"not imported: {each}")
+        if unchanged:
+            warn(f"already in the session with the same content, and not imported again: {', '.join(unchanged)}")
+        for name in names:
+            progress(1.0, f"looking at {name}")
+            for sentence in load_or_save_check(store, store.load_capture(name)).warnings():
+                warn(f"{name}: {sentence}")
+    progress(1.0, "imported")
+    return names
 
 
 def read_captures(
@@ -149,14 +207,6 @@ def find_captures(
     return imports
 
 
-def import_frames(source: Path | str, session: SessionLike, sequence: Path | str, **options: Any) -> list[str]:
-    """Import any folder of images that a TOML describes, as ``import_captures``.
-
-    Where the TOML does not state at which projector coordinate Gray code 0 begins, that is estimated from the images.
-    """
-    return import_captures(source, session, "frames", sequence=sequence, **options)
-
-
 def guess_description(
     folder: Path | str, *, projector: Size | None = None, channel: Channel | None = None
 ) -> GuessedDescription:
@@ -165,77 +215,6 @@ def guess_description(
     Of a folder of captures, the first is read. Raises InputError where the images cannot belong to one capture.
     """
     return guessed_description.guess_toml(Path(folder), None if projector is None else parse_size(projector), channel)
-
-
-def _save_captures(
-    imports: Imports,
-    session: SessionLike,
-    role: Role,
-    origin: str | None,
-    force: bool,
-    strict: bool,
-    progress: Progress,
-    warn: Warn,
-) -> list[str]:
-    """Save what can be read and decoded, and warn of the rest; with `strict`, raise InputError for the first fault."""
-    for message in imports.warnings:
-        warn(message)
-    skipped = list(imports.skipped)
-    if strict and skipped:
-        raise InputError(str(skipped[0]))
-
-    stated: set[str] = set()
-    names: list[str] = []
-    unchanged: list[str] = []
-    damaged: set[str] = set()
-
-    def warn_once(message: str) -> None:
-        """Issue a warning unless the same message was issued before."""
-        if message not in stated:
-            stated.add(message)
-            warn(message)
-
-    def read() -> Iterator[NewCapture]:
-        """Yield the checked captures one by one; one that cannot be used is a warning, or raises with ``strict``."""
-        for i, recording in enumerate(imports.recordings):
-            progress(i / len(imports), f"reading {recording.name}")
-            try:
-                capture = recording.read()
-                checked_capture = check_imported_capture(
-                    replace(capture, frames=capture.merged_frames(), exposures_ms=()), warn
-                )
-            except InputError as error:
-                if strict:
-                    raise
-                skipped.append(Skipped(recording.name, str(error)))
-                continue
-            for message in _list_assumptions(recording, capture):
-                warn_once(message)
-            names.append(capture.name)
-            capture = replace(capture, sequence=checked_capture.sequence, source=origin or capture.source)
-            comparison = store.compare_capture(capture, role)
-            if comparison == "same":
-                unchanged.append(capture.name)
-                continue
-            if comparison == "damaged":
-                warn(f"{capture.name}: its stored frames are damaged: the capture is replaced, and now in the trash")
-                damaged.add(capture.name)
-            yield capture
-        if len(skipped) == len(imports.skipped) + len(imports.recordings):
-            raise none_usable(skipped)
-
-    with opened_or_made(session) as store:
-        store.save_captures(read(), role, force=force or damaged)
-        for each in skipped:
-            warn(f"not imported: {each}")
-        if unchanged:
-            warn(f"already in the session with the same content, and not imported again: {', '.join(unchanged)}")
-        for name in names:
-            progress(1.0, f"looking at {name}")
-            for sentence in load_or_save_check(store, store.load_capture(name)).warnings():
-                warn(f"{name}: {sentence}")
-    progress(1.0, "imported")
-    return names
 
 
 def describe_import(names: Sequence[str], role: Role) -> str:
