@@ -38,7 +38,7 @@ def _listed(inspect: Callable[P, Iterator[str]]) -> Callable[P, list[str]]:
 
     @wraps(inspect)
     def collect(*arguments: P.args, **options: P.kwargs) -> list[str]:
-        plugin, *_ = *arguments, *options.values()
+        plugin = (arguments or tuple(options.values()))[0]
         if isinstance(plugin, type):
             return [f"{plugin.__name__} is a class: give an object of it, {plugin.__name__}(...)"]
         faults: list[str] = []

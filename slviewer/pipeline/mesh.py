@@ -11,6 +11,7 @@ from slviewer.errors import InputError, UsageError
 from slviewer.pipeline.export import check_export
 from slviewer.pipeline.export_shapes import merge_name, merged_points, scan_cloud
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings, part, stage
+from slviewer.pipeline.measured_surface import MERGED
 from slviewer.pipeline.merge import MergedScans, MergeSettings, StartKind, merge_scans
 from slviewer.pipeline.models import ModelName, check_accepted, load_stereo, warn_if_stale
 from slviewer.pipeline.open_session import SessionLike, opened
@@ -28,8 +29,6 @@ from slviewer.surface.texture import TexturedMesh, texture_mesh
 
 TEXTURED_TRIANGLES = 100_000
 """To so many a mesh is thinned that gets a texture, unless another number is given."""
-MERGE = "merge/"
-"""What the name of a merge that the session keeps begins with; its number follows, or nothing for the last one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,9 +113,9 @@ def mesh(
             )
             merged = merge_scans(Job(store, before, warn), settings)
             shape, restrictions = merged.fused.surface, tuple(merged.record.restrictions)
-        elif sources[0].startswith(MERGE):
+        elif sources[0].startswith(MERGED):
             refuse_region(sources[0], roi)
-            name = merge_name(store, sources[0].removeprefix(MERGE))
+            name = merge_name(store, sources[0].removeprefix(MERGED))
             shape = merged_points(store, name, warn)
             restrictions = tuple(load_record(store, Merge, name).restrictions)
         else:
@@ -150,7 +149,7 @@ def _check_request(
     """Raise UsageError for scans and merges that cannot be meshed so, InputError for a file that cannot hold it."""
     if not sources:
         raise UsageError("nothing was named: name one scan, several to merge, or a merge")
-    if len(sources) > 1 and any(name.startswith(MERGE) for name in sources):
+    if len(sources) > 1 and any(name.startswith(MERGED) for name in sources):
         raise UsageError("a merge is meshed by itself: name one merge, or scans")
     if len(sources) > 1 and plan.method == "grid":
         raise UsageError("the method grid joins the pixels of one scan: name one, or use poisson or volume")
@@ -177,7 +176,7 @@ def _textured_scans(
         return {name: merged.clouds[name] for name in merged.fused.names}, merged.alignment.T_reference_scan
     if isinstance(shape, Cloud):
         return {sources[0]: shape}, {sources[0]: np.eye(4)}
-    made = load_record(store, Merge, merge_name(store, sources[0].removeprefix(MERGE)))
+    made = load_record(store, Merge, merge_name(store, sources[0].removeprefix(MERGED)))
     placed = {name: np.array(pair.T_reference_scan, np.float64) for name, pair in made.pairs.items()}
     placed |= {made.reference: np.eye(4)}
     used = made.model or model
