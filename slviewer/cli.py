@@ -27,25 +27,31 @@ from slviewer.commands.wizard import wizard
 from slviewer.errors import Cancelled, SlviewerError
 
 
-def describe_measurement(made: Any, **_: Any) -> str:
+def _describe_measurement(made: Any, **_: Any) -> str:
     """Describe a measurement in one line."""
     from slviewer.pipeline import measurements
 
     return measurements.describe_measurement(made)
 
 
-def describe_simulation(names: list[str], session: Path, **_: Any) -> str:
+def _describe_simulation(names: list[str], session: Path, **_: Any) -> str:
     """Describe how many captures were simulated, and the next command."""
     from slviewer.pipeline.simulate import TARGET
 
     return f"{len(names)} captures simulated into {session}; next: slviewer calibrate {session} --target {TARGET}"
 
 
-def describe_dataset(fetched: Path, **_: Any) -> str:
+def _describe_dataset(fetched: Path, **_: Any) -> str:
     """Describe where a data set is."""
     return f"images in {fetched}"
 
 
+CONFIG = (
+    tyro.conf.OmitArgPrefixes,
+    tyro.conf.OmitSubcommandPrefixes,
+    tyro.conf.FlagCreatePairsOff,
+    tyro.conf.PositionalMetavarFromFieldName,
+)
 DESCRIPTION = "Structured-light 3D scanning: calibrate a camera and a projector, prove it, scan, merge."
 
 
@@ -75,67 +81,60 @@ def _make_operation_command(name: str) -> Callable[..., Any]:
     operation = getattr(registry, "OPERATIONS", {})[name]
     required = [each.name for each in fields(operation.settings) if each.default is MISSING]
     source = f"{operation.function.__module__}:{operation.function.__name__}"
-    return read_command(source, "session", *required, options=[JSON])
+    return read_command(source, "session", *required, options=JSON)
+
+
+def _define_command(source: str, *positional: str, **options: Any) -> Callable[[], Callable[..., Any]]:
+    """Return a function that reads a command from its source, see `read_command`."""
+    return partial(read_command, source, *positional, **options)
 
 
 COMMANDS = Commands(
     {
         "wizard": lambda: wizard,
-        "devices": partial(read_command, "pipeline.devices:devices"),
-        "plugins": partial(read_command, "pipeline.plugins:plugins"),
-        "preflight": partial(read_command, "preflight.check_rig:check_rig", options=CHECKED, run=run_preflight),
-        "capture": partial(
-            read_command, "pipeline.capture:capture", "session", "name", options=[*PAGES], run=run_capture
-        ),
-        "turn": partial(read_command, "pipeline.turn:turn", "session", options=[*PAGES, JSON], run=run_turn),
-        "plan-rig": partial(
-            read_command, "pipeline.plan_rig:plan_rig", "camera", "projector", "distance", options=[JSON]
-        ),
+        "devices": _define_command("pipeline.devices:devices"),
+        "plugins": _define_command("pipeline.plugins:plugins"),
+        "preflight": _define_command("preflight.check_rig:check_rig", options=CHECKED, run=run_preflight),
+        "capture": _define_command("pipeline.capture:capture", "session", "name", options=PAGES, run=run_capture),
+        "turn": _define_command("pipeline.turn:turn", "session", options=[*PAGES, *JSON], run=run_turn),
+        "plan-rig": _define_command("pipeline.plan_rig:plan_rig", "camera", "projector", "distance", options=JSON),
         "import": make_import_command,
-        "calibrate": partial(
-            read_command, "pipeline.calibrate:calibrate", "session", options=CALIBRATED, run=run_calibrate
+        "calibrate": _define_command("pipeline.calibrate:calibrate", "session", options=CALIBRATED, run=run_calibrate),
+        "validate": _define_command("pipeline.validate:validate", "session", options=JSON),
+        "decode": _define_command(
+            "pipeline.decode:write_decoded", "session", "capture", names={"file_format": "format"}
         ),
-        "validate": partial(read_command, "pipeline.validate:validate", "session", options=[JSON]),
-        "decode": partial(
-            read_command, "pipeline.decode:decode", "session", "capture", names={"file_format": "format"}
-        ),
-        "reconstruct": partial(read_command, "pipeline.reconstruct:reconstruct", "session", "capture"),
-        "region": partial(read_command, "pipeline.edit:set_region", "session"),
-        "edit": partial(read_command, "pipeline.edit:edit_scan", "session", "scan", options=[JSON]),
-        "verify": partial(
-            read_command,
+        "reconstruct": _define_command("pipeline.reconstruct:reconstruct", "session", "capture"),
+        "region": _define_command("pipeline.edit:set_region", "session"),
+        "edit": _define_command("pipeline.edit:edit_scan", "session", "scan", options=JSON),
+        "verify": _define_command(
             "pipeline.verify:verify",
             "session",
             "captures",
-            options=[JSON],
+            options=JSON,
             names={"models": "model", "depth_range": "range"},
         ),
-        "align": partial(read_command, "pipeline.align:align", "session", "captures", options=[JSON]),
-        "merge": partial(read_command, "pipeline.merge:merge", "session", "captures", options=[JSON]),
-        "mesh": partial(
-            read_command, "pipeline.mesh:mesh", "session", "names", options=[*MESHING, JSON], run=run_meshing
-        ),
-        "compare": partial(read_command, "pipeline.compare:compare", "session", "scan", "nominal", options=[JSON]),
-        "measure": partial(
-            read_command,
+        "align": _define_command("pipeline.align:align", "session", "captures", options=JSON),
+        "merge": _define_command("pipeline.merge:merge", "session", "captures", options=JSON),
+        "mesh": _define_command("pipeline.mesh:mesh", "session", "names", options=[*MESHING, *JSON], run=run_meshing),
+        "compare": _define_command("pipeline.compare:compare", "session", "scan", "nominal", options=JSON),
+        "measure": _define_command(
             "pipeline.measure:measure",
             "session",
             "scan",
             "what",
-            run=partial(show_result, describe=describe_measurement),
+            run=partial(show_result, describe=_describe_measurement),
         ),
-        "measurements": partial(read_command, "pipeline.measure:edit_measurements", "session"),
-        "plan": partial(read_command, "pipeline.plan:plan", "session"),
-        "inspect-parts": partial(
-            read_command,
+        "measurements": _define_command("pipeline.measure:edit_measurements", "session"),
+        "plan": _define_command("pipeline.plan:plan", "session"),
+        "inspect-parts": _define_command(
             "pipeline.inspect_parts:inspect_parts",
             "plan",
             "sessions",
-            options=[JSON],
+            options=JSON,
             names={"scans": "scan"},
         ),
-        "export": partial(
-            read_command,
+        "export": _define_command(
             "pipeline.export:export",
             "session",
             "what",
@@ -144,36 +143,30 @@ COMMANDS = Commands(
             names={"file_format": "format"},
             run=run_meshing,
         ),
-        "batch": partial(read_command, "pipeline.batch:batch", "sessions", options=[JSON]),
-        "check": partial(read_command, "pipeline.check:check", "session", "capture", options=[JSON]),
-        "accept": partial(read_command, "pipeline.accept:accept", "session", options=[JSON]),
-        "fetch": partial(
-            read_command,
+        "batch": _define_command("pipeline.batch:batch", "sessions", options=JSON),
+        "check": _define_command("pipeline.check:check", "session", "capture", options=JSON),
+        "accept": _define_command("pipeline.accept:accept", "session", options=JSON),
+        "fetch": _define_command(
             "pipeline.datasets:fetch",
             "name",
             "folder",
-            run=partial(show_result, describe=describe_dataset),
+            run=partial(show_result, describe=_describe_dataset),
         ),
-        "simulate": partial(
-            read_command,
+        "simulate": _define_command(
             "pipeline.simulate:simulate",
             "session",
-            run=partial(show_result, describe=describe_simulation),
+            run=partial(show_result, describe=_describe_simulation),
         ),
-        "reproduce": partial(read_command, "validation.reproduce:reproduce", options=[JSON]),
-        "prove": partial(read_command, "validation.prove:prove", options=[JSON], names={"cases": "case"}),
-        "patterns": partial(read_command, "pipeline.printouts:patterns"),
-        "target": partial(read_command, "pipeline.printouts:target", "board"),
-        "detect": partial(
-            read_command, "pipeline.detect:detect_board", "images", options=[JSON], names={"csv_out": "csv"}
-        ),
-        "report": partial(read_command, "pipeline.report:report", "session"),
-        "verify-report": partial(
-            read_command, "pipeline.certificate:verify_report", "session", "report", options=[JSON]
-        ),
-        "inspect": partial(read_command, "pipeline.inspect:inspect", "session"),
-        "restore": partial(read_command, "pipeline.restore:restore", "session", "names"),
-        "bench": partial(read_command, "validation.bench:bench", options=[JSON]),
+        "reproduce": _define_command("validation.reproduce:reproduce", options=JSON),
+        "prove": _define_command("validation.prove:prove", options=JSON, names={"cases": "case"}),
+        "patterns": _define_command("pipeline.printouts:patterns"),
+        "target": _define_command("pipeline.printouts:target", "board"),
+        "detect": _define_command("pipeline.detect:detect_board", "images", options=JSON, names={"csv_out": "csv"}),
+        "report": _define_command("pipeline.report:report", "session"),
+        "verify-report": _define_command("pipeline.certificate:verify_report", "session", "report", options=JSON),
+        "inspect": _define_command("pipeline.inspect:inspect", "session"),
+        "restore": _define_command("pipeline.restore:restore", "session", "names"),
+        "bench": _define_command("validation.bench:bench", options=JSON),
     }
 )
 
@@ -187,33 +180,22 @@ def main(arguments: list[str] | None = None) -> int:
     if arguments == ["--version"]:
         print(f"slviewer {__version__}")
         return 0
-    name = arguments[0]
+    name, *rest = arguments
     try:
-        run = tyro.cli(
-            COMMANDS[name] if name in COMMANDS else union(COMMANDS),
-            prog=f"slviewer {name}" if name in COMMANDS else "slviewer",
-            description=None if name in COMMANDS else DESCRIPTION,
-            args=arguments[1:] if name in COMMANDS else arguments,
-            config=(
-                tyro.conf.OmitArgPrefixes,
-                tyro.conf.OmitSubcommandPrefixes,
-                tyro.conf.FlagCreatePairsOff,
-                tyro.conf.PositionalMetavarFromFieldName,
-            ),
-        )
+        if name in COMMANDS:
+            run = tyro.cli(COMMANDS[name], prog=f"slviewer {name}", args=rest, config=CONFIG)
+        else:
+            run = tyro.cli(union(COMMANDS), prog="slviewer", description=DESCRIPTION, args=arguments, config=CONFIG)
+        run()
     except SystemExit as stop:
         return int(stop.code or 0)
-    except BrokenPipeError:  # the help is piped into `head`
-        return 1
-    try:
-        run()
     except SlviewerError as error:
         terminal.print_message(f"slviewer: {error}")
         return error.exit_status
     except KeyboardInterrupt:
         terminal.print_message("slviewer: cancelled")
         return Cancelled.exit_status
-    except BrokenPipeError:
+    except BrokenPipeError:  # the help, or a result, is piped into `head`
         return 1
     except (MemoryError, RecursionError) as error:
         reason = "needs more memory than there is" if isinstance(error, MemoryError) else "nests values too deep"

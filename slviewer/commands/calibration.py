@@ -22,7 +22,7 @@ CALIBRATED = (
         "Calibrate the camera's lens alone, from pictures of the board; the session stays as it is.",
     ),
     Option("out", Path | None, None, "With --camera-only: write the lens to this .yml, .xml or .json, for OpenCV."),
-    JSON,
+    *JSON,
 )
 """What `calibrate` takes beside the parameters of the pipeline's `calibrate`."""
 

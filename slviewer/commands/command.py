@@ -71,7 +71,7 @@ RANGES: dict[str, tuple[float, float]] = {
     "wait_s": (1, LARGEST),
 }
 """Of the numbers that a command takes, by its parameter, where they are narrower."""
-JSON = Option("json", Path | None, None, "Write the result to this file too.")
+JSON = (Option("json", Path | None, None, "Write the result to this file too."),)
 
 
 def read_command(
@@ -95,13 +95,9 @@ def read_command(
     module = module if module in sys.modules else f"slviewer.{module}"
     definition = _read_definitions(module)[name]
     assert isinstance(definition, ast.FunctionDef)
-    doc, accepted = ast.get_docstring(definition) or "", _list_arguments(definition)
-    if (settings := _find_settings(definition, module)) is not None:  # an operation
-        given = ast.get_docstring(settings) or ""
-        doc = f"{doc}\n\nArgs:\n    session: Session folder.\n{given.partition('Args:' + chr(10))[2]}"
-        accepted = [(ast.arg("session", ast.Name("SessionLike")), None), *_list_fields(settings)]
-    described = re.match(r".*?^Args:\n(?:[ ].*\n?|\n(?=[ ]))*", doc, re.DOTALL | re.MULTILINE)
-    doc = described[0] if described else re.split(r"\n\n", doc)[0]
+    doc, accepted = _read_arguments(definition, module)
+    if "\nArgs:\n" not in doc:
+        doc = doc.partition("\n\n")[0]
     shown = re.findall(r"^ {4}(\w+):", doc, re.MULTILINE)
     parameters = []
     for argument, default in accepted:
@@ -201,6 +197,16 @@ def _check_numbers(arguments: Mapping[str, Any]) -> None:
 def _make_parameter(name: str, kind: Any, default: Any) -> inspect.Parameter:
     """Return a keyword parameter of a command's signature."""
     return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, annotation=kind, default=default)
+
+
+def _read_arguments(definition: ast.FunctionDef, module: str) -> tuple[str, list[tuple[ast.arg, ast.expr | None]]]:
+    """Return the docstring of a function and its parameters; of an operation both are those of its settings."""
+    doc, settings = ast.get_docstring(definition) or "", _find_settings(definition, module)
+    if settings is None:
+        return doc, _list_arguments(definition)
+    _, _, described = (ast.get_docstring(settings) or "").partition("Args:\n")
+    accepted = [(ast.arg("session", ast.Name("SessionLike")), None), *_list_fields(settings)]
+    return f"{doc}\n\nArgs:\n    session: Session folder.\n{described}", accepted
 
 
 def _find_settings(definition: ast.FunctionDef, module: str) -> ast.ClassDef | None:

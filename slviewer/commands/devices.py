@@ -35,7 +35,7 @@ CHECKED = (
         "Session folder and name of a recorded capture, to check its frames instead of a rig.",
     ),
     *PAGES,
-    JSON,
+    *JSON,
 )
 """What `preflight` takes beside the parameters of `check_rig`."""
 

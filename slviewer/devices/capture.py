@@ -80,11 +80,14 @@ def _capture_loaded(
 @dataclass(frozen=True, eq=False)
 class CapturedFrames:
     """Result of `capture_with_texture`: frames (n, h, w), or (k n, h, w) of k `exposures_ms`, the whole sequence in
-    one after the other; the camera's settings; and a colour texture (h, w, 3), None with a monochrome camera.
+    one after the other; the camera's settings; the sequence and the name of the rig; and a colour texture (h, w, 3),
+    None with a monochrome camera.
     """
 
     frames: np.ndarray
     settings: CameraSettings
+    sequence: PatternSequence
+    source: str
     exposures_ms: tuple[float, ...] = ()
     texture: np.ndarray | None = None
 
@@ -104,7 +107,7 @@ def capture_with_texture(
     """
     if not exposures_ms:
         frames = capture_frames(rig, sequence, out, progress)
-        return CapturedFrames(frames, _read_settings(rig), (), _try_capture_colour(rig))
+        return CapturedFrames(frames, _read_settings(rig), sequence, rig.name, (), _try_capture_colour(rig))
     wanted = check_exposures(exposures_ms)
     n = len(sequence.frames)
     out = _allocate(rig, n * len(wanted), out)
@@ -123,7 +126,7 @@ def capture_with_texture(
     finally:
         with contextlib.suppress(DeviceError), report_driver_faults(rig.camera):  # a lost device raises its own error
             rig.camera.apply(before)
-    return CapturedFrames(out, _read_settings(rig), tuple(applied_ms), _try_capture_colour(rig))
+    return CapturedFrames(out, _read_settings(rig), sequence, rig.name, tuple(applied_ms), _try_capture_colour(rig))
 
 
 def check_exposures(exposures_ms: Sequence[float]) -> list[float]:

@@ -107,7 +107,7 @@ class Comparison:
         )
 
 
-def compare(
+def fit_clouds(
     shape: Shape,
     clouds: Mapping[str, Cloud],
     illuminated: np.ndarray | None = None,
@@ -127,10 +127,6 @@ def compare(
     """
     if not clouds:
         raise InputError("No cloud was given to evaluate: name at least one model.")
-    sizes = {cloud.points.shape[:2] for cloud in clouds.values()}
-    if len(sizes) > 1:
-        raise InputError(f"The models' clouds have different sizes, {sizes}: reconstruct them from the same capture.")
-
     every, sigma_z = _merge_clouds(clouds)
     shared = np.logical_and.reduce([cloud.mask for cloud in clouds.values()])
     if len(clouds) > 1 and region is None and np.count_nonzero(shared) < LEAST_PIXELS:
@@ -175,7 +171,11 @@ def compare(
 
 
 def _merge_clouds(clouds: Mapping[str, Cloud]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the first cloud's points and their noise, and the next cloud's where it has none."""
+    """Return the first cloud's points and their noise, and the next cloud's where it has none. InputError where they
+    differ in size."""
+    sizes = {cloud.points.shape[:2] for cloud in clouds.values()}
+    if len(sizes) > 1:
+        raise InputError(f"The models' clouds have different sizes, {sizes}: reconstruct them from the same capture.")
     first, *others = clouds.values()
     points, sigma_z = first.points.copy(), first.sigma_z.copy()
     for cloud in others:

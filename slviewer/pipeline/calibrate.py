@@ -34,6 +34,7 @@ from slviewer.pipeline.models import (
     warn_if_frame_changed,
 )
 from slviewer.pipeline.open_session import SessionLike, match_names, opened, opened_or_made
+from slviewer.pipeline.pose_evidence import DecodedPose
 from slviewer.pipeline.poses import Judged, read_pose
 from slviewer.session.store import Session
 from slviewer.target.board import Board
@@ -226,8 +227,8 @@ def calibrate_frames(
         """Yield the examined pose of each set of frames, decoded one after the other."""
         for name, frames in poses.items():
             phases = decode_frames(name, sequence, frames)
-            texture = texture_8bit(sequence, frames)
-            yield read_pose(name, sequence, frames, phases, texture, board, step_2, examine=True)
+            pose = DecodedPose(name, sequence, frames, phases, texture_8bit(sequence, frames), board)
+            yield read_pose(pose, step_2, examine=True)
 
     diagnosed = calibrate_poses_with_evidence(read(), len(poses), sequence, board, {}, part(progress, 0, 0.65))
     if diagnosed.stereo is None or diagnosed.verdict.level == "rejected":

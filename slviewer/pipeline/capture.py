@@ -4,7 +4,7 @@ import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -39,6 +39,9 @@ from slviewer.target.board import Board
 
 DEFAULT_PATTERNS = "complementary"
 """The sequence used by default: its codes forgive blurred edges, and it is shorter than the Letter's."""
+
+Purpose = Literal["pose", "scan", "plane", "sphere"]
+"""What a capture is made for: all but target poses are scans."""
 
 
 def capture(
@@ -92,12 +95,10 @@ def capture(
     with opened_or_made(session) as store:
         if name in store.taken_names() and not force:
             raise InputError(f"there is a capture {name!r} already: choose another name, or replace it with --force")
-        choice = rig if isinstance(rig, Mapping) else load_rig(rig, store)
+        choice = load_rig(rig, store)
         target = target or (Board.parse(known) if (known := store.decision("target")) else None)
         camera_settings(choice, exposure_ms, gain)  # refused before anything is opened
-        patterns = patterns or str(store.decision("patterns") or DEFAULT_PATTERNS)
-        if choice.get("driver") != "replay":
-            check_patterns(patterns)
+        patterns = choose_patterns(store, choice, patterns)
         progress(0.0, "opening the devices")
         bench = set_up(choice, target)
         sequence = choose_sequence(bench, patterns)
@@ -122,21 +123,26 @@ def capture(
             for note in list_changed_settings(devices.camera, CameraSettings(wanted_ms), CameraSettings(applied_ms)):
                 warn(note)
         progress(0.95, "saving")
-        purpose = "pose" if role == "calibration" else "scan"
-        shown = str(target) if target is not None and role == "calibration" else None
-        saved = save_frames(
-            store, name, role, sequence, captured, source=devices.name, purpose=purpose, board=shown, force=force
-        )
-        try:
-            for sentence in save_check(store, saved).warnings():
-                warn(f"{name}: {sentence}")
-            if not captured.exposures_ms:  # of several, each is meant to be wrong somewhere
-                phases = decode_frames(name, sequence, captured.frames)
-                warn_of_exposure(name, sequence, captured.frames, phases, warn)
-        except SlviewerError as error:  # it is saved, and can be looked at later
-            warn(f"{name} is saved, and its frames could not be checked: {error}")
+        if role == "calibration":
+            saved = save_frames(store, name, "pose", captured, board=target, force=force)
+        else:
+            saved = save_frames(store, name, "scan", captured, force=force)
+        _check_saved(store, saved, captured, warn)
     progress(1.0, "captured")
     return saved
+
+
+def _check_saved(store: Session, saved: Capture, captured: CapturedFrames, warn: Warn) -> None:
+    """Warn where the frames of a saved capture contradict each other, or are too bright or too dark."""
+    name, sequence = saved.name, captured.sequence
+    try:
+        for sentence in save_check(store, saved).warnings():
+            warn(f"{name}: {sentence}")
+        if not captured.exposures_ms:  # of several, each is meant to be wrong somewhere
+            phases = decode_frames(name, sequence, captured.frames)
+            warn_of_exposure(name, sequence, captured.frames, phases, warn)
+    except SlviewerError as error:  # it is saved, and can be looked at later
+        warn(f"{name} is saved, and its frames could not be checked: {error}")
 
 
 def set_camera(rig: Rig, choice: Mapping[str, Any], exposure_ms: float | None, gain: float | None, warn: Warn) -> None:
@@ -157,7 +163,16 @@ def camera_settings(choice: Mapping[str, Any], exposure_ms: float | None, gain: 
     return CameraSettings(exposure_ms, choice.get("gain") if gain is None else gain)
 
 
-def check_patterns(patterns: str) -> None:
+def choose_patterns(store: Session, choice: Mapping[str, Any], patterns: str | None) -> str:
+    """Return the name of the sequence to show, by default the session's. Raises InputError for an unknown one, unless
+    the rig plays back its own."""
+    patterns = patterns or str(store.decision("patterns") or DEFAULT_PATTERNS)
+    if choice.get("driver") != "replay":
+        _check_patterns(patterns)
+    return patterns
+
+
+def _check_patterns(patterns: str) -> None:
     """Raise InputError unless a pattern sequence has this name."""
     if patterns not in PRESETS:
         raise InputError(f"no pattern sequence is called {patterns!r}: use {', '.join(PRESETS)}")
@@ -167,7 +182,7 @@ def choose_sequence(bench: RigSetup, patterns: str) -> PatternSequence:
     """Return the sequence to capture: the one of that name for the rig's devices, or the rig's only one."""
     if bench.reel is not None:
         return bench.reel.sequence
-    check_patterns(patterns)
+    _check_patterns(patterns)
     shown = PRESETS[patterns](bench.rig.projector.size)
     return replace(shown, full_scale=stated_full_scale(bench.rig.camera))
 
@@ -181,13 +196,10 @@ def depth_axis(rig: StereoRig) -> Axis:
 def save_frames(
     store: Session,
     name: str,
-    role: Role,
-    sequence: PatternSequence,
+    purpose: Purpose,
     captured: CapturedFrames,
     *,
-    source: str,
-    purpose: str,
-    board: str | None = None,
+    board: object | None = None,
     turn_step: TurnStep | None = None,
     force: bool = False,
 ) -> Capture:
@@ -196,10 +208,10 @@ def save_frames(
     exposure = {} if captured.exposures_ms else {"exposure_ms": captured.settings.exposure_ms}
     return store.save_capture(
         name,
-        role,
-        sequence,
+        "calibration" if purpose == "pose" else "scan",
+        captured.sequence,
         captured.frames,
-        source=source,
+        source=captured.source,
         texture=captured.texture,
         settings={"purpose": purpose, **exposure, "gain": captured.settings.gain, **turned},
         board=board,

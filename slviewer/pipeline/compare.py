@@ -105,7 +105,6 @@ def compare(
     reach: float | None = None,
     out: Path | str | None = None,
     model: ModelName | None = None,
-    name: str = "",
     accept_rejected: bool = False,
     progress: Progress = ignore_progress,
     warn: Warn = ignore_warnings,
@@ -124,7 +123,7 @@ def compare(
         model: Which calibration to use; by default the best one available.
         accept_rejected: Use the calibration although its verdict rejects it.
 
-    The session stores the result as a measurement called ``name``.
+    The session stores the result as a measurement.
     """
     if out is not None and Path(out).suffix.lower() != ".ply":
         raise UsageError(f"coloured points are written as .ply, not as {Path(out).name}: end its name so")
@@ -140,7 +139,6 @@ def compare(
             tolerance=tolerance,
             reach=reach,
             out=default if out is None else out,
-            name=name,
             progress=part(progress, 0.4, 1.0),
             warn=warn,
         )
@@ -153,14 +151,12 @@ def compare_surface(
     *,
     tolerance: float | None = None,
     reach: float | None = None,
-    initial: np.ndarray | None = None,
     out: Path | str | None = None,
-    name: str = "",
     progress: Progress = ignore_progress,
     warn: Warn = ignore_warnings,
 ) -> NominalComparison:
-    """As ``compare``, of a surface that is there already, in a session open for writing. ``initial`` (4, 4), scan to
-    nominal, replaces the search for a start; without ``out`` no file is written."""
+    """As ``compare``, of a surface that is there already, in a session open for writing. Without ``out`` no file
+    is written."""
     measured = on.measured
     points = on.points[measured].astype(np.float64)
     check_size(nominal, points)
@@ -173,7 +169,6 @@ def compare_surface(
         normals=normals,
         sigma_mm=typical,
         reach_mm=reach,
-        initial=initial,
         progress=stage(progress, 0.0, 0.85, "aligning"),
     )
     if result.coverage < LIKELY_COVERAGE:
@@ -189,7 +184,7 @@ def compare_surface(
         ply = Path(out)
         ply.parent.mkdir(parents=True, exist_ok=True)
         _write_points(ply, on, result, nominal, tolerance)
-    measurement = _save_comparison(store, on, nominal, result, verdict, noise, points, name)
+    measurement = _save_comparison(store, on, nominal, result, verdict, noise, points)
     progress(1.0, "compared")
     return NominalComparison(on.source, on.model, nominal, result, verdict, noise, ply, measurement)
 
@@ -241,7 +236,6 @@ def _save_comparison(
     verdict: ToleranceVerdict | None,
     noise: float,
     points: np.ndarray,
-    name: str,
 ) -> Measurement:
     """Save a comparison as a measurement: figures, alignment, and each point's deviation."""
     numbers = result.statistics()
@@ -282,7 +276,7 @@ def _save_comparison(
         inputs=on.inputs,
         data=data,
         arrays=arrays,
-        name=name or f"{on.source} against {nominal.name}",
+        name=f"{on.source} against {nominal.name}",
     )
 
 

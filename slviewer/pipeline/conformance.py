@@ -6,11 +6,11 @@ Each function returns one line per fault, an empty list where there is none, so 
 
 import shutil
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import replace
-from functools import partial
+from functools import partial, wraps
 from pathlib import Path
-from typing import Any
+from typing import Any, ParamSpec
 
 import numpy as np
 
@@ -29,22 +29,38 @@ from slviewer.target.detect import detect
 _SEEN_LEVEL, _OTHER_LEVEL = 85, 170
 """With which the buffers are filled before two grabs."""
 _ANGLE_TOLERANCE_DEG = 0.5
+P = ParamSpec("P")
 
 
-def check_camera(camera: Camera) -> list[str]:
+def _listed(inspect: Callable[P, Iterator[str]]) -> Callable[P, list[str]]:
+    """Decorate what yields the faults of a plugin: they are returned as a list, with the exception that ends it early,
+    if one does."""
+
+    @wraps(inspect)
+    def collect(*arguments: P.args, **options: P.kwargs) -> list[str]:
+        plugin = (arguments or tuple(options.values()))[0]
+        if isinstance(plugin, type):
+            return [f"{plugin.__name__} is a class: give an object of it, {plugin.__name__}(...)"]
+        faults: list[str] = []
+        try:
+            faults.extend(inspect(*arguments, **options))
+        except Exception as error:  # whatever a plugin raises is a fault of it
+            faults.append(f"the check ended early with {type(error).__name__}: {error}")
+        return faults
+
+    return collect
+
+
+@_listed
+def check_camera(camera: Camera) -> Iterator[str]:
     """List what a closed camera does against the protocol `Camera`. It is opened, grabs some frames, and is closed."""
-    return _collect(_inspect_camera, camera)
-
-
-def _inspect_camera(faults: list[str], camera: Camera) -> None:
-    """Append the faults."""
-    faults += _check_size(camera)
+    yield from _check_size(camera)
     if not isinstance(camera.dtype, np.dtype) or camera.dtype not in (np.uint8, np.uint16):
-        faults.append(f"dtype is {camera.dtype!r}: it must be np.dtype(np.uint8) or np.dtype(np.uint16)")
+        yield f"dtype is {camera.dtype!r}: it must be np.dtype(np.uint8) or np.dtype(np.uint16)"
         return
     width, height = camera.size
     frame = np.zeros((height, width), camera.dtype)
-    faults += _check_opening(camera, lambda: camera.grab(frame))
+    yield from _check_opening(camera, lambda: camera.grab(frame))
     camera.open()
     try:
         frames = [np.full((height, width), level, camera.dtype) for level in (_SEEN_LEVEL, _OTHER_LEVEL)]
@@ -52,70 +68,63 @@ def _inspect_camera(faults: list[str], camera: Camera) -> None:
             camera.grab(each)
         untouched = (frames[0] == _SEEN_LEVEL) & (frames[1] == _OTHER_LEVEL)
         if np.count_nonzero(untouched) > frame.size // 1000:  # some may have these levels in truth
-            faults.append(f"grab left {np.count_nonzero(untouched)} of {frame.size} pixels as they were: fill them all")
+            yield f"grab left {np.count_nonzero(untouched)} of {frame.size} pixels as they were: fill them all"
         largest, stated = int(np.max(frames)), stated_full_scale(camera)
         if stated is None and camera.dtype == np.uint16:
-            faults.append("full_scale is missing: state the grey level at which the camera clips, such as 4095")
+            yield "full_scale is missing: state the grey level at which the camera clips, such as 4095"
         if stated is not None and not largest <= stated <= np.iinfo(camera.dtype).max:
-            faults.append(f"full_scale is {stated}, and {camera.dtype} frames reach {largest}: state where they clip")
+            yield f"full_scale is {stated}, and {camera.dtype} frames reach {largest}: state where they clip"
         wrong = np.zeros((height + 1, width), camera.dtype)
-        faults += _expect(InputError, lambda: camera.grab(wrong), "grab into an array of another shape")
+        yield from _expect(InputError, lambda: camera.grab(wrong), "grab into an array of another shape")
         other = np.zeros((height, width), np.float32)
-        faults += _expect(InputError, lambda: camera.grab(other), "grab into an array of another type")
+        yield from _expect(InputError, lambda: camera.grab(other), "grab into an array of another type")
         for name, call in (("settings", camera.settings), ("apply", lambda: camera.apply(CameraSettings()))):
             if not isinstance(call(), CameraSettings):
-                faults.append(f"{name} does not return CameraSettings")
+                yield f"{name} does not return CameraSettings"
         exposure = camera.settings().exposure_ms
         applied = camera.apply(CameraSettings(exposure_ms=exposure)).exposure_ms
         if applied != camera.settings().exposure_ms:
-            faults.append(f"apply returns {applied} ms, and settings {camera.settings().exposure_ms} ms after it")
+            yield f"apply returns {applied} ms, and settings {camera.settings().exposure_ms} ms after it"
         if exposure is not None and (applied is None or not np.isclose(applied, exposure, rtol=0.05)):
-            faults.append(f"apply of the present exposure, {exposure:g} ms, leaves {applied} ms")
+            yield f"apply of the present exposure, {exposure:g} ms, leaves {applied} ms"
     finally:
         camera.close()
 
 
-def check_projector(projector: Projector) -> list[str]:
+@_listed
+def check_projector(projector: Projector) -> Iterator[str]:
     """List what a closed projector does against the protocol `Projector`. It is opened, shows a sequence, and is
     closed."""
-    return _collect(_inspect_projector, projector)
-
-
-def _inspect_projector(faults: list[str], projector: Projector) -> None:
-    """Append the faults."""
-    faults += _check_size(projector)
-    faults += _check_opening(projector, lambda: projector.show_level(0))
+    yield from _check_size(projector)
+    yield from _check_opening(projector, lambda: projector.show_level(0))
     projector.open()
     try:
-        faults += _expect(DeviceError, lambda: projector.show(0), "show before load")
+        yield from _expect(DeviceError, lambda: projector.show(0), "show before load")
         width, height = projector.size
         frames = (Frame("white"), Frame("black"), *phase_steps("x", 3, 16.0), *phase_steps("y", 3, 16.0))
         other = PatternSequence((width + 1, height), frames)
-        faults += _expect(InputError, lambda: projector.load(other), "load of patterns of another size")
+        yield from _expect(InputError, lambda: projector.load(other), "load of patterns of another size")
         for sequence in (complementary((width, height)), PatternSequence((width, height), frames)):
             projector.load(sequence)
             for index in (0, len(sequence.frames) - 1):
                 projector.show(index)
         for index in (-1, len(frames)):
-            faults += _expect(InputError, partial(projector.show, index), f"show of frame {index}")
+            yield from _expect(InputError, partial(projector.show, index), f"show of frame {index}")
         for level in (0, 128, 255, None):
             projector.show_level(level)
         for level in (-1, 256):
-            faults += _expect(InputError, partial(projector.show_level, level), f"show_level of {level}")
-        faults += _expect(None, lambda: projector.show(0), "show after show_level, where the sequence stays loaded,")
+            yield from _expect(InputError, partial(projector.show_level, level), f"show_level of {level}")
+        yield from _expect(None, lambda: projector.show(0), "show after show_level, where the sequence stays loaded,")
     finally:
         projector.close()
 
 
-def check_turntable(turntable: Turntable, turn_deg: float = 5.0) -> list[str]:
+@_listed
+def check_turntable(turntable: Turntable, turn_deg: float = 5.0) -> Iterator[str]:
     """List what a closed turntable does against the protocol `Turntable`. It turns by an angle and back."""
-    return _collect(_inspect_turntable, turntable, turn_deg)
-
-
-def _inspect_turntable(faults: list[str], turntable: Turntable, turn_deg: float) -> None:
-    """Append the faults."""
-    faults += [] if turntable.name else ["name is empty"]
-    faults += _check_opening(turntable, turntable.position_deg)
+    if not (turntable.name):
+        yield "name is empty"
+    yield from _check_opening(turntable, turntable.position_deg)
     turntable.open()
     try:
         start = turntable.position_deg()
@@ -124,52 +133,49 @@ def _inspect_turntable(faults: list[str], turntable: Turntable, turn_deg: float)
         for angle in (to, start):
             turntable.turn_to(angle)
             if abs(turntable.position_deg() - angle) > _ANGLE_TOLERANCE_DEG:
-                faults.append(f"after turn_to({angle:g}) it stands at {turntable.position_deg():g} degrees")
+                yield f"after turn_to({angle:g}) it stands at {turntable.position_deg():g} degrees"
         if limits is not None:
-            faults += _expect(InputError, lambda: turntable.turn_to(limits[1] + 1), "turn_to beyond the limits")
+            yield from _expect(InputError, lambda: turntable.turn_to(limits[1] + 1), "turn_to beyond the limits")
 
         def cancel() -> None:
             raise Cancelled("cancelled")
 
-        faults += _expect(Cancelled, lambda: turntable.turn_to(to, cancel), "turn_to with a check that raises")
+        yield from _expect(Cancelled, lambda: turntable.turn_to(to, cancel), "turn_to with a check that raises")
         turntable.turn_to(start)
     finally:
         turntable.close()
 
 
-def check_importer(layout: FolderLayout, capture: Path, **options: Any) -> list[str]:
+@_listed
+def check_importer(layout: FolderLayout, capture: Path, **options: Any) -> Iterator[str]:
     """List what a layout does wrong with a folder that holds one capture; ``options`` are those of its ``read``.
 
     Its frames are decoded and compared with their description, as an import does: use a sound capture, recorded or
     rendered. A copy of the folder without its first image, and an empty folder, must be refused or skipped with a
     reason.
     """
-    return _collect(_inspect_importer, layout, capture, options)
-
-
-def _inspect_importer(faults: list[str], layout: FolderLayout, capture: Path, options: Mapping[str, Any]) -> None:
-    """Append the faults."""
     if not layout.is_capture(capture):
-        faults.append(f"is_capture is False for {capture}")
+        yield f"is_capture is False for {capture}"
         return
     imports = layout.read(capture, **options)
-    faults += [] if len(imports) == 1 else [f"read finds {len(imports)} captures in {capture}, which is one"]
+    if len(imports) != 1:
+        yield f"read finds {len(imports)} captures in {capture}, which is one"
     for recording in imports.recordings:
         expected = len(recording.sequence.frames) * max(1, len(recording.exposures_ms))
         if len(recording.files) != expected:
-            faults.append(f"{recording.name}: {len(recording.files)} images for {expected} frames")
+            yield f"{recording.name}: {len(recording.files)} images for {expected} frames"
             continue
         try:
             new = recording.read()
             check_imported_capture(replace(new, frames=new.merged_frames(), exposures_ms=()), ignore_warnings)
         except InputError as error:
-            faults.append(str(error))
+            yield str(error)
     with tempfile.TemporaryDirectory() as folder:
         empty = Path(folder) / "empty"
         empty.mkdir()
         if layout.is_capture(empty):
-            faults.append("is_capture is True for an empty folder")
-        faults += _expect(InputError, lambda: layout.read(empty, **options), "read of an empty folder")
+            yield "is_capture is True for an empty folder"
+        yield from _expect(InputError, lambda: layout.read(empty, **options), "read of an empty folder")
         shorter = Path(folder) / "captures" / capture.name
         shutil.copytree(capture, shorter)
         missing = imports.recordings[0].files[0].resolve().relative_to(capture.resolve())
@@ -180,62 +186,44 @@ def _inspect_importer(faults: list[str], layout: FolderLayout, capture: Path, op
             pass
         else:
             if len(incomplete):
-                faults.append(f"a capture without {missing} is read as if it were complete")
+                yield f"a capture without {missing} is read as if it were complete"
 
 
-def check_board(notation: str) -> list[str]:
+@_listed
+def check_board(notation: str) -> Iterator[str]:
     """List what is wrong with the board of an installed plugin, by a notation such as its example."""
-    return _collect(_inspect_board, notation)
-
-
-def _inspect_board(faults: list[str], notation: str) -> None:
-    """Append the faults."""
     board = Board.parse(notation)
-    faults += [] if Board.parse(str(board)) == board else [f"{board} is another board than {notation}"]
+    if Board.parse(str(board)) != board:
+        yield f"{board} is another board than {notation}"
     points = board.points
     if len(np.unique(np.round(points, 6), axis=0)) != len(points):
-        faults.append("some features have the same coordinates")
+        yield "some features have the same coordinates"
     for level in (0, 128, 255):
         blank = np.full((480, 640), level, np.uint8)
-        faults += _expect(DetectionError, partial(detect, board, blank), "detection in an empty image")
+        yield from _expect(DetectionError, partial(detect, board, blank), "detection in an empty image")
 
 
-def check_exporter(exporter: Exporter) -> list[str]:
+@_listed
+def check_exporter(exporter: Exporter) -> Iterator[str]:
     """List what is wrong with a file format: it must encode small shapes with and without normals and colours."""
-    return _collect(_inspect_exporter, exporter)
-
-
-def _inspect_exporter(faults: list[str], exporter: Exporter) -> None:
-    """Append the faults."""
     rng = np.random.default_rng(0)
     points = rng.normal(0, 10, (4, 3)).astype(np.float32)
     normals = np.tile(np.array([0, 0, 1], np.float32), (4, 1))
     colours = rng.integers(0, 255, (4, 3)).astype(np.uint8)
     faces = np.array([[0, 1, 2], [1, 2, 3]], np.int32)
-    faults += [] if exporter.name == exporter.name.lower() and exporter.name.isalnum() else ["name is no plain suffix"]
+    if not (exporter.name == exporter.name.lower() and exporter.name.isalnum()):
+        yield "name is no plain suffix"
     shapes: list[PointSet | Mesh] = []
     if exporter.takes_points:
         shapes += [PointSet(points), PointSet(points, normals=normals, colours=colours)]
     if exporter.takes_meshes:
         shapes += [Mesh(points, faces), Mesh(points, faces, normals=normals, colours=colours)]
     if not shapes:
-        faults.append("it takes neither points nor meshes")
+        yield "it takes neither points nor meshes"
     for shape in shapes:
         content = exporter.encode(shape, {"sigma": np.full(4, 0.01, np.float32)}, ("a note",))
         if not isinstance(content, bytes) or not content:
-            faults.append(f"encode of a {type(shape).__name__} does not return bytes")
-
-
-def _collect(inspect: Callable[..., None], plugin: Any, *arguments: Any) -> list[str]:
-    """Return the faults that an inspection appends, and the exception that ends it early, if one does."""
-    if isinstance(plugin, type):
-        return [f"{plugin.__name__} is a class: give an object of it, {plugin.__name__}(...)"]
-    faults: list[str] = []
-    try:
-        inspect(faults, plugin, *arguments)
-    except Exception as error:  # whatever a plugin raises is a fault of it
-        faults.append(f"the check ended early with {type(error).__name__}: {error}")
-    return faults
+            yield f"encode of a {type(shape).__name__} does not return bytes"
 
 
 def _check_size(device: Camera | Projector) -> list[str]:

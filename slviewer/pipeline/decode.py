@@ -107,7 +107,7 @@ def axis_figures(phase: PhaseMap) -> dict[str, Any]:
     return figures | dict(zip(names, values, strict=True))
 
 
-def decode(
+def write_decoded(
     session: SessionLike,
     capture: str,
     out: Path | str,
@@ -136,6 +136,7 @@ def decode(
         _, _, phases = next(decode_captures(store, [capture], warn, relative=True))
     progress(0.6, "writing")
     folder.mkdir(parents=True, exist_ok=True)
+    save = write_exr if file_format == "exr" else np.save
     files: dict[str, str] = {}
     for axis, phase in phases.items():
         maps = {
@@ -146,10 +147,7 @@ def decode(
         }
         for name, values in maps.items():
             files[f"{name}_{axis}"] = file = f"{name}_{axis}.{file_format}"
-            if file_format == "exr":
-                write_exr(folder / file, values)
-            else:
-                np.save(folder / file, values)
+            save(folder / file, values)
         files[f"reason_{axis}"] = file = f"reason_{axis}.{'png' if file_format == 'exr' else 'npy'}"
         if file_format == "exr":
             (folder / file).write_bytes(cv2.imencode(".png", phase.reason)[1].tobytes())

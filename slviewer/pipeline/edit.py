@@ -157,15 +157,13 @@ def change_history(store: Session, scan: str, *, undo: int = 0, redo: int = 0) -
 
 def undo_last(store: Session, scans: Sequence[str]) -> None:
     """Undo the last edit among those of several scans, of all scans that it was made of. InputError where none is."""
-    histories = {scan: load_edits(store, scan) for scan in scans}
-    made = {scan: history.active[-1].made for scan, history in histories.items() if history.active}
+    made = {scan: edits[-1].made for scan in scans if (edits := load_edits(store, scan).active)}
     _change_together(store, made, max(made.values(), default=""), undo=1)
 
 
 def redo_next(store: Session, scans: Sequence[str]) -> None:
     """Bring back what `undo_last` undid last. InputError where nothing was undone."""
-    histories = {scan: load_edits(store, scan) for scan in scans}
-    made = {scan: history.undone[0].made for scan, history in histories.items() if history.undone}
+    made = {scan: edits[0].made for scan in scans if (edits := load_edits(store, scan).undone)}
     _change_together(store, made, min(made.values(), default=""), redo=1)
 
 

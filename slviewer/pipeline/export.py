@@ -11,7 +11,7 @@ from slviewer.pipeline.export_documents import (
     write_poses,
     write_table,
 )
-from slviewer.pipeline.export_shapes import merge_name, merge_shape, scan_shape
+from slviewer.pipeline.export_shapes import DescribedShape, merge_name, merge_shape, scan_shape
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings, part
 from slviewer.pipeline.models import ModelName, check_accepted, preferred_model, warn_if_stale
 from slviewer.pipeline.open_session import SessionLike, opened
@@ -144,12 +144,13 @@ def export(
             check_accepted(store, accept_rejected)
         if what not in ("report", "table", "merge", "merged-mesh"):  # reading a merge warns by itself
             warn_if_stale(store, warn)
-        if what in ("mesh", "merged-mesh"):
-            words = _write_shape(
-                store, what, name, target, model, plan or MeshingPlan(), accept_rejected, roi, progress, warn
-            )
-        elif what in ("cloud", "merge"):
-            words = _write_shape(store, what, name, target, model, None, accept_rejected, roi, progress, warn)
+        plan, making = (plan or MeshingPlan()) if "mesh" in what else None, part(progress, 0, 0.8)
+        if what in ("cloud", "mesh"):
+            shape = scan_shape(store, name, model, plan, making, warn, accept_rejected, roi)
+            words = _write_shape(shape, target, progress)
+        elif what in ("merge", "merged-mesh"):
+            refuse_region(f"merge/{name}", roi)
+            words = _write_shape(merge_shape(store, name, plan, making, warn), target, progress)
         elif what == "report":
             report(store, target, progress=progress, warn=warn)
             words = "report"
@@ -160,28 +161,11 @@ def export(
     return Exported(target, target.stat().st_size, words)
 
 
-def _write_shape(
-    store: Session,
-    what: What,
-    name: str,
-    target: Path,
-    model: str | None,
-    plan: MeshingPlan | None,
-    accept_rejected: bool,
-    roi: str,
-    progress: Progress,
-    warn: Warn,
-) -> str:
+def _write_shape(shape: DescribedShape, target: Path, progress: Progress) -> str:
     """Write a scan or a merge as points or a mesh, and return a description of what was written."""
-    making = part(progress, 0, 0.8)
-    if what in ("cloud", "mesh"):
-        made = scan_shape(store, name, model, plan, making, warn, accept_rejected, roi)
-    else:
-        refuse_region(f"merge/{name}", roi)
-        made = merge_shape(store, name, plan, making, warn)
     progress(0.85, f"writing {target.name}")
-    write_shape(target, made.shape, scalars=made.scalars, notes=made.notes)
-    return made.text()
+    write_shape(target, shape.shape, scalars=shape.scalars, notes=shape.notes)
+    return shape.text()
 
 
 def _write_document(store: Session, what: What, name: str, target: Path, model: str | None) -> str:

@@ -11,6 +11,7 @@ from slviewer.calibration.pixelwise import PixelwiseModel
 from slviewer.calibration.splined.model import SplinedModel
 from slviewer.errors import InputError
 from slviewer.geometry.rig import StereoRig
+from slviewer.geometry.rigid import rigid_transform
 from slviewer.pipeline.models import available_models, frame_of, load_model, load_stereo
 from slviewer.pipeline.scale import scale_factor
 from slviewer.pipeline.stored_records import Stored, list_records
@@ -77,27 +78,21 @@ def write_calibration_file(store: Session, path: Path, model: str) -> str:
     """
     stereo, factor = load_stereo(store), scale_factor(store, model)
     fitted = load_model(store, model)
-    rig, fits = stereo.rig, {}
+    rig, fits, depths, count = stereo.rig, {}, stereo.depth_range_mm, len(stereo.poses)
     if isinstance(fitted, SplinedModel):
         camera, projector = fit_splined(fitted)
-        rig, fits = (
-            StereoRig(camera.lens, projector.lens, fitted.rig.R, fitted.rig.t),
-            {
-                "camera": camera,
-                "projector": projector,
-            },
-        )
+        rig = StereoRig(camera.lens, projector.lens, fitted.rig.R, fitted.rig.t)
+        fits = {"camera": camera, "projector": projector}
+        depths, count = fitted.bundle.depth_range_mm, len(fitted.bundle.poses)
     elif isinstance(fitted, PixelwiseModel):
         fits = {"camera": pixelwise_residuals(fitted, rig.camera)}
     T = _scaled_transform(rig.T_projector_camera, factor)
-    depths = fitted.bundle.depth_range_mm if isinstance(fitted, SplinedModel) else stereo.depth_range_mm
-    poses = fitted.bundle.poses if isinstance(fitted, SplinedModel) else tuple(stereo.poses)
     entries: dict[str, Any] = {
         "program": f"slviewer {__version__}",
         "units": "mm, px",
         "model": model,
         "frame": frame_of(store, model),
-        **({"target": stereo.board} if stereo.board else {}),
+        "target": stereo.board or None,
         "camera_size": np.array(rig.camera.size),
         "projector_size": np.array(rig.projector.size),
         "K_camera": rig.camera.K,
@@ -109,10 +104,11 @@ def write_calibration_file(store: Session, path: Path, model: str) -> str:
         "T_projector_camera": T,
         "T_camera_projector": np.linalg.inv(T),
         "baseline_mm": factor * float(np.linalg.norm(rig.t)),
-        **({"scale_factor": factor} if factor != 1 else {}),
-        **({"depth_range_mm": factor * np.array(depths)} if depths else {}),
-        **({"target_poses": len(poses)} if poses else {}),
+        "scale_factor": None if factor == 1 else factor,
+        "depth_range_mm": factor * np.array(depths) if depths else None,
+        "target_poses": count or None,
     }
+    entries = {name: value for name, value in entries.items() if value is not None}
     for device, fit in fits.items():
         entries |= {f"fit_rms_px_{device}": fit.rms_px, f"fit_max_px_{device}": fit.max_px}
     if not isinstance(fitted, SplinedModel):
@@ -204,9 +200,8 @@ def _target_pose_entries(store: Session, model: str) -> list[dict[str, Any]]:
     if isinstance(fitted, SplinedModel):
         bundle = fitted.bundle
         rms = {name: (fit.camera_rms_px, fit.projector_rms_px) for name, fit in bundle.fits.items()}
-        poses = {name: np.eye(4) for name in bundle.poses}
-        for name, R, t in zip(bundle.poses, bundle.state.R_board, bundle.state.t_board, strict=True):
-            poses[name][:3, :3], poses[name][:3, 3] = R, t
+        T_camera_board = rigid_transform(bundle.state.R_board, bundle.state.t_board)
+        poses = dict(zip(bundle.poses, T_camera_board, strict=True))
     else:
         stereo = load_stereo(store)
         poses, rms = dict(stereo.poses), dict(stereo.pose_rms_px)
@@ -240,9 +235,7 @@ def _projector_transform(store: Session, model: str) -> np.ndarray:
         return _scaled_transform(load_stereo(store).rig.T_projector_camera, scale_factor(store, model))
     splined = load_model(store, model)
     assert isinstance(splined, SplinedModel)
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = splined.rig.R, splined.rig.t
-    return _scaled_transform(T, scale_factor(store, model))
+    return _scaled_transform(rigid_transform(splined.rig.R, splined.rig.t), scale_factor(store, model))
 
 
 def _scaled_transform(T: np.ndarray, factor: float) -> np.ndarray:

@@ -10,7 +10,7 @@ from slviewer.errors import InputError
 from slviewer.pipeline.capture_clouds import capture_cloud, check_capture_sizes
 from slviewer.pipeline.capture_phases import capture_texture, decode_captures
 from slviewer.pipeline.feedback import Progress, Warn, part
-from slviewer.pipeline.models import frame_of, load_model, preferred_model
+from slviewer.pipeline.models import frame_of, load_model
 from slviewer.pipeline.open_session import numbered_results
 from slviewer.pipeline.scale import describe_scale
 from slviewer.pipeline.scan_edits import resolve_region, restrict_cloud, restriction_notes
@@ -96,7 +96,7 @@ def _whole_cloud(
             names = {"points", "sigma_z", "texture", "sigma_calibration", "sigma_edges"} & set(meta["arrays"])
             arrays = store.load_result(stored, only=names)[1]
             return Cloud(axis=meta["axis"], model=meta["model"], **arrays)
-    fitted = load_model(store, model or preferred_model(store))
+    fitted = load_model(store, model)
     progress(0.1, f"reading {name}")
     check_capture_sizes(store, [name])
     _, frames, phases = next(decode_captures(store, [name], warn))

@@ -1,6 +1,5 @@
 """Making a calibration from elsewhere the session's own, once it agrees with itself and with the session's captures."""
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -75,7 +74,9 @@ def import_opencv_calibration(
         for device, size in sizes.items():
             if size is not None and not witnessed:
                 _check_principal_point(device, matrices[f"K_{device}"], size, warn)
-        _replace_calibration(store, there, matrices, str(file), sizes)
+        with store.together():
+            trash_models(store, there)
+            save_imported_stereo(store, matrices, source=str(file), **sizes)
         return load_stereo(store) if None not in sizes.values() else None
 
 
@@ -146,16 +147,3 @@ def _check_principal_point(device: str, K: np.ndarray, size: tuple[int, int], wa
             "shifted, or the calibration was made at another pixel scale; import a capture with patterns along both "
             "axes, and the calibration after it: the patterns then tell"
         )
-
-
-def _replace_calibration(
-    store: Session,
-    there: Sequence[str],
-    matrices: dict[str, np.ndarray],
-    source: str,
-    sizes: dict[str, tuple[int, int] | None],
-) -> None:
-    """Save the calibration in place of those that are there, in one step."""
-    with store.together():
-        trash_models(store, there)
-        save_imported_stereo(store, matrices, source=source, camera=sizes["camera"], projector=sizes["projector"])

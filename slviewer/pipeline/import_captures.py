@@ -64,8 +64,9 @@ def import_captures(
         strict: Import nothing where one capture cannot be used, instead of skipping it with a warning.
 
     ``layout`` is one of `layouts.layouts()`, or "detect": the one that the file names show. Captures are named after
-    their folders. ``sequence`` is the TOML of the layout frames, by default the one in ``source``. ``origin`` is
-    recorded as where the captures come from, by default their folders. ``options`` are those of the layout's `read`.
+    their folders. ``sequence`` is the TOML of the layout frames, by default the one in ``source``; where Gray code 0
+    begins is estimated from the images if it does not state that. ``origin`` is recorded as where the captures come
+    from, by default their folders. ``options`` are those of the layout's `read`.
 
     Captures that cannot be read or decoded are skipped, and ``warn`` is called with the reason. Raises InputError where
     none is left, or, with ``strict``, for the first of them; nothing is saved then. Captures that are there already,
@@ -82,100 +83,6 @@ def import_captures(
         warn=warn,
         **options,
     )
-    return _save_captures(imports, session, role, origin, force, strict, progress, warn)
-
-
-def read_captures(
-    source: Path | str,
-    layout: str = "detect",
-    *,
-    sequence: Path | str | None = None,
-    projector: Size | None = None,
-    channel: Channel | None = None,
-    warn: Warn = ignore_warnings,
-    **options: Any,
-) -> list[NewCapture]:
-    """Read a folder of captures of any known layout into memory, as ``import_captures`` does; nothing is saved.
-
-    Of several exposures each pixel comes from the longest that did not clip it. Raises InputError where an image cannot
-    be used; captures that are incomplete are skipped with a warning.
-    """
-    imports = find_captures(source, layout, sequence, projector=projector, channel=channel, warn=warn, **options)
-    for message in (*imports.warnings, *map(str, imports.skipped)):
-        warn(message)
-    return [replace(capture, frames=capture.merged_frames(), exposures_ms=()) for capture in imports]
-
-
-def find_captures(
-    source: Path | str,
-    layout: str = "detect",
-    sequence: Path | str | None = None,
-    *,
-    prefix: str | None = None,
-    projector: Size | None = None,
-    channel: Channel | None = None,
-    session: SessionLike | None = None,
-    warn: Warn = ignore_warnings,
-    **options: Any,
-) -> Imports:
-    """The captures of a folder, not yet read; ``session`` knows the projector's size where it is not stated."""
-    source = expand_user(source)
-    if layout == "detect":
-        layout = "frames" if sequence is not None else detect_layout(source)
-    known = layouts()
-    if layout not in known:
-        raise InputError(
-            f"the layout {layout!r} is unknown: use {', '.join(known)}{LAYOUT_PLUGINS.explain_missing(layout)}"
-        )
-    size = known[layout].projector if projector is None else parse_size(projector)
-    if layout == "frames":
-        toml = sequence or find_description(source)
-        if toml is None:
-            raise InputError(f"{source} holds no TOML that describes the images: add one, or give --sequence")
-        options["toml"] = Path(toml)
-    assumed = _known_projector_size(session) if size is None and session is not None and layout != "frames" else None
-    try:
-        imports = known[layout].read(source, prefix=prefix, projector=size or assumed, **options)
-    except InputError:
-        _warn_of_assumed_size(assumed, warn)  # it may be why
-        raise
-    sizes = {recording.sequence.projector_size for recording in imports.recordings}
-    if assumed in sizes:  # a layout that states the size itself does not use it
-        _warn_of_assumed_size(assumed, warn)
-    if channel is not None:
-        imports = replace(imports, recordings=[replace(recording, channel=channel) for recording in imports.recordings])
-    return imports
-
-
-def import_frames(source: Path | str, session: SessionLike, sequence: Path | str, **options: Any) -> list[str]:
-    """Import any folder of images that a TOML describes, as ``import_captures``.
-
-    Where the TOML does not state at which projector coordinate Gray code 0 begins, that is estimated from the images.
-    """
-    return import_captures(source, session, "frames", sequence=sequence, **options)
-
-
-def guess_description(
-    folder: Path | str, *, projector: Size | None = None, channel: Channel | None = None
-) -> GuessedDescription:
-    """The TOML of a capture without a description, from its images; ``doubts`` name what stays open. Nothing is saved.
-
-    Of a folder of captures, the first is read. Raises InputError where the images cannot belong to one capture.
-    """
-    return guessed_description.guess_toml(Path(folder), None if projector is None else parse_size(projector), channel)
-
-
-def _save_captures(
-    imports: Imports,
-    session: SessionLike,
-    role: Role,
-    origin: str | None,
-    force: bool,
-    strict: bool,
-    progress: Progress,
-    warn: Warn,
-) -> list[str]:
-    """Save what can be read and decoded, and warn of the rest; with `strict`, raise InputError for the first fault."""
     for message in imports.warnings:
         warn(message)
     skipped = list(imports.skipped)
@@ -234,6 +141,80 @@ def _save_captures(
                 warn(f"{name}: {sentence}")
     progress(1.0, "imported")
     return names
+
+
+def read_captures(
+    source: Path | str,
+    layout: str = "detect",
+    *,
+    sequence: Path | str | None = None,
+    projector: Size | None = None,
+    channel: Channel | None = None,
+    warn: Warn = ignore_warnings,
+    **options: Any,
+) -> list[NewCapture]:
+    """Read a folder of captures of any known layout into memory, as ``import_captures`` does; nothing is saved.
+
+    Of several exposures each pixel comes from the longest that did not clip it. Raises InputError where an image cannot
+    be used; captures that are incomplete are skipped with a warning.
+    """
+    imports = find_captures(source, layout, sequence, projector=projector, channel=channel, warn=warn, **options)
+    for message in (*imports.warnings, *map(str, imports.skipped)):
+        warn(message)
+    return [replace(capture, frames=capture.merged_frames(), exposures_ms=()) for capture in imports]
+
+
+def find_captures(
+    source: Path | str,
+    layout: str = "detect",
+    sequence: Path | str | None = None,
+    *,
+    prefix: str | None = None,
+    projector: Size | None = None,
+    channel: Channel | None = None,
+    session: SessionLike | None = None,
+    warn: Warn = ignore_warnings,
+    **options: Any,
+) -> Imports:
+    """The captures of a folder, not yet read; ``session`` knows the projector's size where it is not stated."""
+    source = expand_user(source)
+    if layout == "detect":
+        layout = "frames" if sequence is not None else detect_layout(source)
+    known = layouts()
+    if layout not in known:
+        raise InputError(
+            f"the layout {layout!r} is unknown: use {', '.join(known)}{LAYOUT_PLUGINS.explain_missing(layout)}"
+        )
+    size = known[layout].projector if projector is None else parse_size(projector)
+    assumed = None
+    if layout == "frames":
+        toml = sequence or find_description(source)
+        if toml is None:
+            raise InputError(f"{source} holds no TOML that describes the images: add one, or give --sequence")
+        options["toml"] = Path(toml)
+    elif size is None and session is not None:
+        assumed = _known_projector_size(session)
+    try:
+        imports = known[layout].read(source, prefix=prefix, projector=size or assumed, **options)
+    except InputError:
+        _warn_of_assumed_size(assumed, warn)  # it may be why
+        raise
+    sizes = {recording.sequence.projector_size for recording in imports.recordings}
+    if assumed in sizes:  # a layout that states the size itself does not use it
+        _warn_of_assumed_size(assumed, warn)
+    if channel is not None:
+        imports = replace(imports, recordings=[replace(recording, channel=channel) for recording in imports.recordings])
+    return imports
+
+
+def guess_description(
+    folder: Path | str, *, projector: Size | None = None, channel: Channel | None = None
+) -> GuessedDescription:
+    """The TOML of a capture without a description, from its images; ``doubts`` name what stays open. Nothing is saved.
+
+    Of a folder of captures, the first is read. Raises InputError where the images cannot belong to one capture.
+    """
+    return guessed_description.guess_toml(Path(folder), None if projector is None else parse_size(projector), channel)
 
 
 def describe_import(names: Sequence[str], role: Role) -> str:

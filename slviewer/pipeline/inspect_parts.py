@@ -2,8 +2,9 @@
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from slviewer.errors import InputError, SlviewerError, UsageError
 from slviewer.evaluation.acceptance.figures import Decision
@@ -141,20 +142,20 @@ def inspect_parts(
     read = read_plan(plan)
     sources: list[tuple[str, Callable[[Progress], MeasuredSurface]]] = []
     folders = list_sessions(sessions)
+
+    def load(folder: Path, scan: str, report: Progress) -> MeasuredSurface:
+        """Load one part's surface."""
+        return load_surface(folder, scan, model=model, accept_rejected=accept_rejected, progress=report, warn=warn)
+
     for folder in folders:
-
-        def load(scan: str, report: Progress, folder: Path = folder) -> MeasuredSurface:
-            """Load one part's surface."""
-            return load_surface(folder, scan, model=model, accept_rejected=accept_rejected, progress=report, warn=warn)
-
         try:
             names = _list_scans(folder, scans)
         except SlviewerError as error:
-            sources.append((folder.name, _refuse(error)))
+            sources.append((folder.name, partial(_refuse, error)))
             continue
         for name in names:
             label = name if len(folders) == 1 else f"{folder.name}/{name}"
-            sources.append((label, lambda report, load=load, name=name: load(name, report)))  # type: ignore[misc]
+            sources.append((label, partial(load, folder, name)))
     folder = Path(f"{Path(plan).with_suffix('')}-results") if out is None else out
     return write_inspection(inspect_surfaces(read, sources, progress), folder)
 
@@ -228,11 +229,6 @@ def _list_scans(folder: Path, patterns: Sequence[str]) -> list[str]:
     return merges
 
 
-def _refuse(error: SlviewerError) -> Callable[[Progress], MeasuredSurface]:
-    """What raises the error in place of loading a surface."""
-
-    def load(report: Progress) -> MeasuredSurface:
-        """Raise the error."""
-        raise error
-
-    return load
+def _refuse(error: SlviewerError, report: Progress) -> NoReturn:
+    """Raise the error in place of loading a surface."""
+    raise error

@@ -14,16 +14,13 @@ from slviewer.pipeline.measurements import (
     add_point,
     add_relation,
     add_section,
-    delete_measurement,
     describe_measurement,
     export_measurements,
     load_measurements,
-    relabel_measurement,
-    undo_delete,
 )
 from slviewer.pipeline.models import ModelName, available_models
 from slviewer.pipeline.open_session import SessionLike, opened
-from slviewer.session.measurements import Measurement
+from slviewer.session.measurements import Measurement, rename_measurement, restore_measurement, trash_measurement
 from slviewer.session.store import Session
 
 What = Literal["point", "distance", "section", "plane", "sphere", "cylinder"]
@@ -136,11 +133,11 @@ def edit_measurements(
         if relate:
             _warn_of_partial_uncertainty(store, add_relation(store, *relate), warn)
         if name:
-            relabel_measurement(store, *name)
+            rename_measurement(store, *name)
         for each in delete:
-            delete_measurement(store, each)
+            trash_measurement(store, each)
         if bring_back:
-            undo_delete(store)
+            restore_measurement(store)
         return _list_measurements(store, csv)
 
 

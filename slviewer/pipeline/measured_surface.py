@@ -22,6 +22,7 @@ from slviewer.session.scan_edits import restriction_inputs
 from slviewer.session.store import Session
 
 MERGED = "merge/"
+"""What the name of a merge that the session keeps begins with; its number follows, for meshes nothing for the last."""
 Place = tuple[int, int] | int
 """A point of a surface: pixel (u, v) of a scan, or the index of a merged surface's point."""
 

@@ -1,4 +1,4 @@
-"""Measurements on scans: made, saved with the session, listed, renamed, deleted and brought back, written as CSV.
+"""Measurements on scans: made, saved with the session, listed, written as CSV.
 
 Every function takes a session's folder or one that is open, and saves what it makes; the browser calls the same.
 """
@@ -31,10 +31,7 @@ from slviewer.session.measurements import (
     list_measurements,
     load_measurement,
     measurement_arrays,
-    rename_measurement,
-    restore_measurement,
     save_measurement,
-    trash_measurement,
 )
 from slviewer.session.store import Session
 
@@ -94,7 +91,7 @@ def add_relation(session: SessionLike, a: str, b: str, name: str = "") -> Measur
         source = first.source if first.source == second.source else f"{first.source}, {second.source}"
         quantities = relation(one, one_spread, other, other_spread)
         model = first.model if first.model == second.model else f"{first.model}, {second.model}"
-        saved = save_measurement(
+        return save_measurement(
             store,
             "relation",
             source=source,
@@ -105,7 +102,6 @@ def add_relation(session: SessionLike, a: str, b: str, name: str = "") -> Measur
             of=(a, b),
             name=name or f"{first.name} – {second.name}",
         )
-        return saved
 
 
 def add_section(session: SessionLike, on: MeasuredSurface, a: Place, b: Place, name: str = "") -> Measurement:
@@ -150,24 +146,6 @@ def load_measurements(session: SessionLike) -> list[Measurement]:
     """Load all measurements, in the order in which they were made; stale where their inputs have changed."""
     with opened(session) as store:
         return [replace(each, stale=_is_stale(store, each)) for each in list_measurements(store)]
-
-
-def delete_measurement(session: SessionLike, identity: str) -> None:
-    """Move a measurement to the trash."""
-    with opened(session, write=True) as store:
-        trash_measurement(store, identity)
-
-
-def undo_delete(session: SessionLike, identity: str = "") -> Measurement:
-    """Undo ``delete_measurement``, by default the last one."""
-    with opened(session, write=True) as store:
-        return restore_measurement(store, identity)
-
-
-def relabel_measurement(session: SessionLike, identity: str, name: str) -> Measurement:
-    """Give a measurement another name."""
-    with opened(session, write=True) as store:
-        return rename_measurement(store, identity, name)
 
 
 def describe_measurement(measured: Measurement) -> str:

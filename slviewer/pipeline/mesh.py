@@ -1,6 +1,6 @@
 """From captures, or from a stored merge, to a mesh in a file."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -11,6 +11,7 @@ from slviewer.errors import InputError, UsageError
 from slviewer.pipeline.export import check_export
 from slviewer.pipeline.export_shapes import merge_name, merged_points, scan_cloud
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings, part, stage
+from slviewer.pipeline.measured_surface import MERGED
 from slviewer.pipeline.merge import MergedScans, MergeSettings, StartKind, merge_scans
 from slviewer.pipeline.models import ModelName, check_accepted, load_stereo, warn_if_stale
 from slviewer.pipeline.open_session import SessionLike, opened
@@ -28,8 +29,6 @@ from slviewer.surface.texture import TexturedMesh, texture_mesh
 
 TEXTURED_TRIANGLES = 100_000
 """To so many a mesh is thinned that gets a texture, unless another number is given."""
-MERGE = "merge/"
-"""What the name of a merge that the session keeps begins with; its number follows, or nothing for the last one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,21 +93,10 @@ def mesh(
     ``merge/`` alone is the session's last merge. The points of merged scans are written next to the mesh.
     """
     sources = tuple(dict.fromkeys(names))
-    if not sources:
-        raise UsageError("nothing was named: name one scan, several to merge, or a merge")
-    if len(sources) > 1 and any(name.startswith(MERGE) for name in sources):
-        raise UsageError("a merge is meshed by itself: name one merge, or scans")
-    if len(sources) > 1 and plan is not None and plan.method == "grid":
-        raise UsageError("the method grid joins the pixels of one scan: name one, or use poisson or volume")
-    if out is not None:
-        check_export("mesh", Path(out).suffix.lower().removeprefix("."))
-    if texture is not None:
-        if out is not None and Path(out).suffix.lower() not in (".glb", ".obj"):
-            raise UsageError(f"{Path(out).name} holds no texture: end its name in .glb or .obj")
-        plan = plan or MeshingPlan()
-        plan = plan if plan.triangles is not None else replace(plan, triangles=TEXTURED_TRIANGLES)
-    if white and texture is None:
-        raise UsageError("--white balances the colours of a texture: give --texture too")
+    plan = plan or MeshingPlan()
+    _check_request(sources, plan, out, texture, white)
+    if texture is not None and plan.triangles is None:
+        plan = replace(plan, triangles=TEXTURED_TRIANGLES)
     merged = None
     with opened(session) as store:
         check_accepted(store, accept_rejected)
@@ -125,34 +113,53 @@ def mesh(
             )
             merged = merge_scans(Job(store, before, warn), settings)
             shape, restrictions = merged.fused.surface, tuple(merged.record.restrictions)
-        elif sources[0].startswith(MERGE):
+        elif sources[0].startswith(MERGED):
             refuse_region(sources[0], roi)
-            name = merge_name(store, sources[0].removeprefix(MERGE))
+            name = merge_name(store, sources[0].removeprefix(MERGED))
             shape = merged_points(store, name, warn)
             restrictions = tuple(load_record(store, Merge, name).restrictions)
         else:
             warn_if_stale(store, warn)
             shape = scan_cloud(store, sources[0], model, before, warn, accept_rejected, roi)
             restrictions = restriction_notes(store, sources, resolve_region(store, roi))
-        scans = {} if texture is None else _textured_scans(store, sources, shape, merged, model, warn, accept_rejected)
-        light = None if texture is None else _projector_place(store)
+        if texture is not None:
+            clouds, poses = _textured_scans(store, sources, shape, merged, model, warn, accept_rejected)
+            rig = load_stereo(store).rig
     merging = None if merged is None else show_found(merged.found)
     meshed = build_mesh(shape, plan, part(progress, 0.5, 0.95 if texture is None else 0.6))
     notes = (f"of {', '.join(sources)}", *restrictions, *meshed.text().splitlines())
+    textured = None
     if texture is None:
         progress(0.95, f"writing {path.name}")
         write_shape(path, meshed.mesh, notes=notes)
-        progress(1.0, "meshed")
-        return MeshResult(meshed, sources, path, merging)
-    clouds, poses = {name: each[0] for name, each in scans.items()}, {name: each[1] for name, each in scans.items()}
-    if gains is not None:
-        clouds = {name: _balance_cloud(name, cloud, gains) for name, cloud in clouds.items()}
-    painting = stage(progress, 0.6, 0.95, "projecting the scans onto the mesh")
-    textured = texture_mesh(meshed.mesh, clouds, poses, size=texture, light=light, progress=painting)
-    progress(0.95, f"writing {path.name}")
-    write_textured(path, textured.mesh, textured.uv, textured.image, (*notes, textured.text()))
+    else:
+        if gains is not None:
+            clouds = {name: _balance_cloud(name, cloud, gains) for name, cloud in clouds.items()}
+        projector, painting = -rig.R.T @ rig.t, stage(progress, 0.6, 0.95, "projecting the scans onto the mesh")
+        textured = texture_mesh(meshed.mesh, clouds, poses, size=texture, light=projector, progress=painting)
+        progress(0.95, f"writing {path.name}")
+        write_textured(path, textured.mesh, textured.uv, textured.image, (*notes, textured.text()))
     progress(1.0, "meshed")
     return MeshResult(meshed, sources, path, merging, textured)
+
+
+def _check_request(
+    sources: Sequence[str], plan: MeshingPlan, out: Path | str | None, texture: int | None, white: str
+) -> None:
+    """Raise UsageError for scans and merges that cannot be meshed so, InputError for a file that cannot hold it."""
+    if not sources:
+        raise UsageError("nothing was named: name one scan, several to merge, or a merge")
+    if len(sources) > 1 and any(name.startswith(MERGED) for name in sources):
+        raise UsageError("a merge is meshed by itself: name one merge, or scans")
+    if len(sources) > 1 and plan.method == "grid":
+        raise UsageError("the method grid joins the pixels of one scan: name one, or use poisson or volume")
+    if out is not None:
+        suffix = Path(out).suffix.lower()
+        check_export("mesh", suffix.removeprefix("."))
+        if texture is not None and suffix not in (".glb", ".obj"):
+            raise UsageError(f"{Path(out).name} holds no texture: end its name in .glb or .obj")
+    if white and texture is None:
+        raise UsageError("--white balances the colours of a texture: give --texture too")
 
 
 def _textured_scans(
@@ -163,21 +170,20 @@ def _textured_scans(
     model: ModelName | None,
     warn: Warn,
     accept_rejected: bool,
-) -> dict[str, tuple[Cloud, np.ndarray]]:
+) -> tuple[Mapping[str, Cloud], Mapping[str, np.ndarray]]:
     """Return the cloud of every scan that the mesh is made of, and its pose (4, 4) in the mesh's frame."""
     if merged is not None:
-        poses = merged.alignment.T_reference_scan
-        return {name: (merged.clouds[name], poses[name]) for name in merged.fused.names}
+        return {name: merged.clouds[name] for name in merged.fused.names}, merged.alignment.T_reference_scan
     if isinstance(shape, Cloud):
-        return {sources[0]: (shape, np.eye(4))}
-    made = load_record(store, Merge, merge_name(store, sources[0].removeprefix(MERGE)))
+        return {sources[0]: shape}, {sources[0]: np.eye(4)}
+    made = load_record(store, Merge, merge_name(store, sources[0].removeprefix(MERGED)))
     placed = {name: np.array(pair.T_reference_scan, np.float64) for name, pair in made.pairs.items()}
     placed |= {made.reference: np.eye(4)}
     used = made.model or model
-    return {  # what lies outside of the region still hides the surface from a scan
-        name: (scan_cloud(store, name, used, ignore_progress, warn, accept_rejected, OFF), placed[name])
-        for name in made.scans
+    clouds = {  # what lies outside of the region still hides the surface from a scan
+        name: scan_cloud(store, name, used, ignore_progress, warn, accept_rejected, OFF) for name in made.scans
     }
+    return clouds, placed
 
 
 def _balance_cloud(name: str, cloud: Cloud, gains: np.ndarray) -> Cloud:
@@ -185,9 +191,3 @@ def _balance_cloud(name: str, cloud: Cloud, gains: np.ndarray) -> Cloud:
     if cloud.texture is None or cloud.texture.ndim != 3:
         raise InputError(f"the picture of {name} has no colours: make the texture without a white balance")
     return replace(cloud, texture=balance(cloud.texture, gains))
-
-
-def _projector_place(store: Session) -> np.ndarray:
-    """Return the place (3,) mm of the projector's lens in the camera's frame."""
-    rig = load_stereo(store).rig
-    return np.asarray(-rig.R.T @ rig.t)

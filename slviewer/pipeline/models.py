@@ -143,11 +143,12 @@ def load_residuals(store: Session) -> dict[str, np.ndarray]:
     return {name.removeprefix("residuals_"): r for name, r in arrays.items() if name.startswith("residuals_")}
 
 
-def load_model(store: Session, name: str) -> Model:
-    """One calibration by name.
+def load_model(store: Session, name: str | None) -> Model:
+    """One calibration by name; by default the preferred one.
 
     The last ``MAX_LOADED`` stay in memory.
     """
+    name = name or preferred_model(store)
     if name not in available_models(store):
         there = ", ".join(available_models(store))
         raise InputError(

@@ -1,6 +1,6 @@
 """An inspection plan from the measurements of a session, to repeat them on other scans."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -32,7 +32,6 @@ TOLERANCE_MM = 0.1
 LEAST_TOLERANCE_MM, MOST_TOLERANCE_MM = 1e-3, 1e3
 _DECIMALS = 4
 """Of nominal values and limits in a plan."""
-FITTED = ("plane", "sphere", "cylinder")
 FORM_OF = {"plane": "flatness", "sphere": "roundness", "cylinder": "cylindricity"}
 
 
@@ -84,56 +83,59 @@ def make_plan(
 ) -> Plan:
     """The plan of a session's fitted planes, spheres and cylinders, and of the relations between them."""
     with opened(session) as store:
-        measured = {each.id: each for each in load_measurements(store)}
-        fits = {each.id: each for each in measured.values() if each.kind in FITTED and not each.stale}
+        measured = load_measurements(store)
+        fits = _select_fits(measured, warn)
         features = {identity: load_feature(store, each)[0] for identity, each in fits.items()}
-    if not fits:
-        raise InputError("nothing was fitted in this session: fit planes, spheres or cylinders to a scan first")
-    if len(sources := {each.source for each in fits.values()}) > 1:
-        last = list(fits.values())[-1].source
-        warn(f"measurements were made on {', '.join(sorted(sources))}: the plan takes those on {last} alone")
-        fits = {identity: each for identity, each in fits.items() if each.source == last}
-    T = np.eye(4)
+    names, T, alignment = _distinct_names(fits), np.eye(4), Alignment()
     if datums:
         if missing := [each for each in datums if each not in fits]:
             raise InputError(f"{', '.join(missing)} is no fit to align by: there are {', '.join(fits)}")
         T = datum_frame([features[each] for each in datums])
+        start = tuple(map(tuple, T.round(9).tolist()))
+        alignment = Alignment("3-2-1", None, tuple(names[each] for each in datums), start)  # type: ignore[arg-type]
     elif nominal is not None:
         ideal, source = read_nominal(nominal), next(iter(fits.values()))
         surface = load_surface(session, source.source, model=source.model, progress=progress, warn=warn)
         T = fit_to_nominal(surface, ideal).T_nominal_scan
-    names = _distinct_names(fits)
+        alignment = Alignment("best fit", str(nominal.expanduser().absolute()))
     listed = [_plan_feature(names[i], each, features[i], T) for i, each in fits.items()]
-    characteristics: list[Characteristic] = []
-    for i, each in fits.items():
-        for quantity in each.quantities:
-            if quantity.name == "diameter":
-                characteristics.append(_around(f"{names[i]} diameter", quantity, (names[i],), tolerance))
-        kind = FORM_OF[each.kind]
-        characteristics.append(Characteristic(f"{names[i]} {kind}", kind, (names[i],), upper=tolerance))
-    for each in measured.values():
-        if each.kind == "relation" and not each.stale and all(i in fits for i in each.of):
-            pair = tuple(names[i] for i in each.of)
-            for quantity in each.quantities:
-                if quantity.name in KINDS:
-                    title = f"{pair[0]} – {pair[1]} {quantity.name}"
-                    characteristics.append(_around(title, quantity, pair, tolerance))
-    left_out = [each.name for each in measured.values() if each.kind not in (*FITTED, "relation") or each.stale]
+    left_out = [each.name for each in measured if each.kind not in (*FORM_OF, "relation") or each.stale]
     if left_out:
         warn(f"a plan holds fits and their relations that are not stale: {', '.join(left_out)} are not in it")
-    alignment = Alignment()
-    if datums:
-        start = tuple(tuple(row) for row in T.round(9).tolist())
-        alignment = Alignment("3-2-1", None, tuple(names[each] for each in datums), start)  # type: ignore[arg-type]
-    elif nominal is not None:
-        alignment = Alignment("best fit", str(nominal.expanduser().absolute()))
-    return Plan(name, tuple(listed), tuple(characteristics), alignment)
+    return Plan(name, tuple(listed), tuple(_list_characteristics(measured, names, tolerance)), alignment)
 
 
-def _around(name: str, quantity: Quantity, features: tuple[str, ...], tolerance: float) -> Characteristic:
+def _select_fits(measured: Sequence[Measurement], warn: Warn) -> dict[str, Measurement]:
+    """The fits that are not stale, by id; warns where several scans have some: those of the last one are taken."""
+    fits = [each for each in measured if each.kind in FORM_OF and not each.stale]
+    if not fits:
+        raise InputError("nothing was fitted in this session: fit planes, spheres or cylinders to a scan first")
+    last = fits[-1].source
+    if len(sources := {each.source for each in fits}) > 1:
+        warn(f"measurements were made on {', '.join(sorted(sources))}: the plan takes those on {last} alone")
+    return {each.id: each for each in fits if each.source == last}
+
+
+def _list_characteristics(
+    measured: Sequence[Measurement], names: Mapping[str, str], tolerance: float
+) -> Iterator[Characteristic]:
+    """Size and form of the fits in ``names``, by id, then the relations between two of them."""
+    relations = [each for each in measured if each.kind == "relation" and not each.stale and names.keys() >= {*each.of}]
+    for each in [*(each for each in measured if each.id in names), *relations]:
+        form = FORM_OF.get(each.kind)
+        features = (names[each.id],) if form else tuple(names[i] for i in each.of)
+        for quantity in each.quantities:
+            if quantity.name in (("diameter",) if form else KINDS):
+                yield _around(quantity, features, tolerance)
+        if form:
+            yield Characteristic(f"{features[0]} {form}", form, features, upper=tolerance)
+
+
+def _around(quantity: Quantity, features: tuple[str, ...], tolerance: float) -> Characteristic:
     """A characteristic with a tolerance around its measured value."""
     nominal = round(quantity.value, _DECIMALS)
     lower, upper = round(nominal - tolerance, _DECIMALS), round(nominal + tolerance, _DECIMALS)
+    name = f"{' – '.join(features)} {quantity.name}"
     return Characteristic(name, quantity.name, features, nominal, lower, upper, quantity.unit)
 
 

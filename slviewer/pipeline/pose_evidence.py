@@ -1,6 +1,7 @@
 """Evidence of one target pose, computed once and stored in the session as `evidence/<name>`."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -22,28 +23,37 @@ EVIDENCE_VERSION = 3
 """Version of the examination; evidence that was stored by another version is computed again."""
 
 
+@dataclass(frozen=True, eq=False)
+class DecodedPose:
+    """The frames (n, h, w) of a target pose with what they were decoded to; ``texture`` (h, w) or (h, w, 3) uint8 shows
+    the board."""
+
+    name: str
+    sequence: PatternSequence
+    frames: np.ndarray
+    phases: Mapping[Axis, PhaseMap]
+    texture: np.ndarray
+    board: Board
+
+
 def gather_evidence(
-    name: str,
-    sequence: PatternSequence,
-    frames: np.ndarray,
-    phases: Mapping[Axis, PhaseMap],
-    board: Board,
-    texture: np.ndarray,
+    pose: DecodedPose,
     check: FrameCheck,
     detection: Detection | None,
     observation: Observation | None,
     refused: str = "",
 ) -> PoseEvidence:
-    """Evidence from the decoded frames (n, h, w) of a pose. ``detection`` and ``observation``: its board and its phase,
-    None where they could not be read, for the reason ``refused``; ``check``: of its frames.
+    """Evidence from a decoded pose. ``detection`` and ``observation``: its board and its phase, None where they could
+    not be read, for the reason ``refused``; ``check``: of its frames.
     """
-    on_board = board_mask(board, detection, texture.shape) if detection is not None else None
+    sequence, frames, board = pose.sequence, pose.frames, pose.board
+    on_board = board_mask(board, detection, pose.texture.shape) if detection is not None else None
     suspects = {suspect.frame: suspect for suspect in check.suspects}
     return PoseEvidence(
-        name=name,
+        name=pose.name,
         refused=refused,
-        grid=detect_grid_size(board, texture) if detection is None else None,
-        axes={axis: measure_axis(sequence, frames, phase, on_board) for axis, phase in phases.items()},
+        grid=detect_grid_size(board, pose.texture) if detection is None else None,
+        axes={axis: measure_axis(sequence, frames, phase, on_board) for axis, phase in pose.phases.items()},
         suspects=tuple(suspects[i] for i in sorted(suspects)),
         displaced=measure_white_delay(sequence, frames),
         moved_px=np.nan

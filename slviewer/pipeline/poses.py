@@ -11,11 +11,10 @@ from slviewer.calibration.diagnosis.evidence import PoseEvidence
 from slviewer.calibration.observe import READING_VERSION, Observation, Smoothing, observe
 from slviewer.errors import DamagedError, InputError
 from slviewer.fringe.phase import PhaseMap
-from slviewer.fringe.sequence import Axis, PatternSequence
+from slviewer.fringe.sequence import Axis
 from slviewer.pipeline.capture_phases import capture_texture, check_capture, decode_capture, read_ahead
 from slviewer.pipeline.frame_check import FrameCheck, check_frames, load_or_save_check
-from slviewer.pipeline.pose_evidence import gather_evidence as examine_frames
-from slviewer.pipeline.pose_evidence import load_evidence, save_evidence
+from slviewer.pipeline.pose_evidence import DecodedPose, gather_evidence, load_evidence, save_evidence
 from slviewer.session.capture import Capture
 from slviewer.session.store import Session
 from slviewer.target.board import Board
@@ -33,12 +32,7 @@ class Judged:
 
 
 def read_pose(
-    name: str,
-    sequence: PatternSequence,
-    frames: np.ndarray,
-    phases: dict[Axis, PhaseMap],
-    texture: np.ndarray,
-    board: Board,
+    pose: DecodedPose,
     smoothing: Smoothing,
     examine: bool = False,
     check: Callable[[], FrameCheck] | None = None,
@@ -46,16 +40,16 @@ def read_pose(
 ) -> Judged:
     """Return the observation of a decoded target pose, or the reason why there is none.
 
-    ``texture`` (h, w) or (h, w, 3) uint8 shows the board. ``examine``: with the evidence of its frames (n, h, w), of
-    which ``check`` returns the check (computed if None). ``observed`` is called with the observation before the frames
-    are checked, after which the pose may still be refused.
+    ``examine``: with the evidence of its frames, of which ``check`` returns the check (computed if None). ``observed``
+    is called with the observation before the frames are checked, after which the pose may still be refused.
     """
+    name, sequence, frames, phases = pose.name, pose.sequence, pose.frames, pose.phases
     detection: Detection | None = None
     observation: Observation | None = None
     refused = ""
     try:
-        detection = detect(board, texture)
-        observation = observe(name, board, detection, phases, smoothing)
+        detection = detect(pose.board, pose.texture)
+        observation = observe(name, pose.board, detection, phases, smoothing)
         observed(observation)
     except InputError as error:
         refused = str(error).removeprefix(f"{name}: ")
@@ -67,9 +61,7 @@ def read_pose(
             refused = str(error).removeprefix(f"{name}: ")
     evidence = None
     if checked is not None:
-        evidence = examine_frames(
-            name, sequence, frames, phases, board, texture, checked, detection, observation, refused
-        )
+        evidence = gather_evidence(pose, checked, detection, observation, refused)
     return Judged(name, None if refused else observation, refused, evidence)
 
 
@@ -84,11 +76,9 @@ def read_stored_pose(
     observed: Callable[[Observation], None] = lambda observation: None,
 ) -> Judged:
     """Read the pose as ``read_pose`` does, and save the result and the check of the frames in the session."""
-    texture = capture_texture(capture, frames)
+    pose = DecodedPose(capture.name, capture.sequence, frames, phases, capture_texture(capture, frames), board)
     check = partial(load_or_save_check, store, capture, frames)
-    judged = read_pose(
-        capture.name, capture.sequence, frames, phases, texture, board, smoothing, examine, check, observed
-    )
+    judged = read_pose(pose, smoothing, examine, check, observed)
     if judged.evidence is not None:
         save_evidence(store, capture, board, judged.evidence)
     meta = {

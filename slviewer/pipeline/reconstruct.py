@@ -9,7 +9,7 @@ import numpy as np
 
 from slviewer.calibration.splined.model import SplinedModel
 from slviewer.errors import DetectionError, InputError
-from slviewer.evaluation.compare import Comparison, compare
+from slviewer.evaluation.compare import Comparison, fit_clouds
 from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis
 from slviewer.pipeline.capture_clouds import absolute_phases, capture_cloud, check_capture_sizes
@@ -131,7 +131,7 @@ def reconstruct_capture(job: Job, settings: ReconstructSettings) -> Reconstructe
     board, region = None, segment_board(store, shot, texture, warn) if is_pose else None
     if region is not None:
         depths = load_stereo(store).depth_range_mm
-        board = compare("plane", clouds, illuminated_pixels(phases, clouds), region=region, depth_range=depths)
+        board = fit_clouds("plane", clouds, illuminated_pixels(phases, clouds), region=region, depth_range=depths)
     cloud, restrictions = clouds[name], tuple[str, ...]()
     if not is_pose:
         box = resolve_region(store, settings.roi)

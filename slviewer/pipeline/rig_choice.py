@@ -86,15 +86,15 @@ def _set_up_devices(choice: Choice, board: Board | None, pages: PageChannels | N
             rig = chosen.rig(**options)
             return RigSetup(replace(rig, settle_ms=settle_ms or rig.settle_ms), focal_px=focal)
         camera, projector = (dict(options.pop(which)) for which in ("camera", "projector"))
-        eye, lamp = driver(camera.pop("driver")), driver(projector.pop("driver"))
-        if eye.camera is None or lamp.projector is None:
+        camera_driver, projector_driver = driver(camera.pop("driver")), driver(projector.pop("driver"))
+        if camera_driver.camera is None or projector_driver.projector is None:
             raise InputError("one of the drivers offers no such device: choose others")
-        rig = Rig(
-            str(choice.get("name", "rig")),
-            eye.camera(**camera, **({"page": pages and pages.camera} if eye.page else {})),
-            lamp.projector(**projector, **({"page": pages and pages.projector} if lamp.page else {})),
-            settle_ms,
-        )
+        if camera_driver.page:
+            camera["page"] = pages and pages.camera
+        if projector_driver.page:
+            projector["page"] = pages and pages.projector
+        devices = camera_driver.camera(**camera), projector_driver.projector(**projector)
+        rig = Rig(str(choice.get("name", "rig")), *devices, settle_ms)
         return RigSetup(rig, focal_px=focal)
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"the rig {dict(choice)} cannot be set up ({error}): choose it again") from error

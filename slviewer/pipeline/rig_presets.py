@@ -56,13 +56,15 @@ def rigs(session: Session | None = None) -> str:
     return "\n".join(lines)
 
 
-def load_rig(path_or_name: Path | str, session: Session | None = None) -> dict[str, Any]:
-    """Load the checked choice in a TOML file, or of the preset of that name.
+def load_rig(rig: RigLike, session: Session | None = None) -> dict[str, Any]:
+    """Load the checked choice in a TOML file, or of the preset of that name; a mapping is returned as it is.
 
     Raises InputError for a file or a name that does not exist, an unknown key or driver, DeviceError where a package is
     missing.
     """
-    path = expand_user(path_or_name)
+    if isinstance(rig, Mapping):
+        return dict(rig)
+    path = expand_user(rig)
     if path.suffix.lower() == ".toml" or path.is_file():
         if not path.is_file():
             raise InputError(
@@ -71,9 +73,9 @@ def load_rig(path_or_name: Path | str, session: Session | None = None) -> dict[s
         preset = _read_preset(path.stem, path)
     else:
         named = {preset.name: preset for preset in presets(session)}
-        if str(path_or_name) not in named:
-            raise InputError(f"no rig is called {str(path_or_name)!r}: use {_list_names(session)}, or name a TOML file")
-        preset = _read_preset(str(path_or_name), named[str(path_or_name)].source)
+        if str(rig) not in named:
+            raise InputError(f"no rig is called {str(rig)!r}: use {_list_names(session)}, or name a TOML file")
+        preset = _read_preset(str(rig), named[str(rig)].source)
     for name in _driver_names(preset.choice):
         driver(name)  # raises where it cannot be used
     return dict(preset.choice)

@@ -188,11 +188,6 @@ class _Bracket:
         chosen = tuple(self._look(exposure).exposure_ms for exposure in chosen)
         state, state_before = self._classify(chosen, lit), self._classify(self._applied(current_ms), lit)
         share, share_before = (np.count_nonzero(each == 1) / np.count_nonzero(lit) for each in (state, state_before))
-        best = self._looks[chosen[0]].background
-        for exposure in chosen[1:]:
-            look = self._looks[exposure]
-            best = np.where(look.peak < self._clip, look.background * (chosen[0] / exposure), best)
-        tone = np.sqrt(np.clip(best / max(float(np.quantile(best[lit], 0.99)), 1e-6), 0, 1))
         return ExposureSuggestion(
             chosen,
             gain,
@@ -201,9 +196,18 @@ class _Bracket:
             self._duration_s(np.array(chosen)),
             state,
             state_before,
-            (255 * tone).astype(np.uint8),
+            self._draw_scene(chosen, lit),
             self._stride,
         )
+
+    def _draw_scene(self, exposures_ms: tuple[float, ...], lit: NDArray[np.bool_]) -> NDArray[np.uint8]:
+        """The scene (h, w) as an image, each pixel from the longest of these exposures that does not saturate it."""
+        best = self._looks[exposures_ms[0]].background
+        for exposure in exposures_ms[1:]:
+            look = self._looks[exposure]
+            best = np.where(look.peak < self._clip, look.background * (exposures_ms[0] / exposure), best)
+        tone = np.sqrt(np.clip(best / max(float(np.quantile(best[lit], 0.99)), 1e-6), 0, 1))
+        return (255 * tone).astype(np.uint8)
 
     @property
     def _full(self) -> float:

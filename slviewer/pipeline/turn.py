@@ -4,7 +4,7 @@ Each capture is saved, with its angle, before the table turns on; whatever ends 
 the missing steps can be captured later.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -15,9 +15,8 @@ from slviewer.devices.protocols import Rig, Turntable
 from slviewer.errors import Cancelled, DeviceError, InputError, SlviewerError, TurntableError, UsageError
 from slviewer.fringe.sequence import one_axis
 from slviewer.pipeline.capture import (
-    DEFAULT_PATTERNS,
-    check_patterns,
     check_space,
+    choose_patterns,
     choose_sequence,
     depth_axis,
     save_frames,
@@ -28,7 +27,7 @@ from slviewer.pipeline.merge import MergeSettings, StartKind
 from slviewer.pipeline.merge import merge as merge_operation
 from slviewer.pipeline.mesh import MeshResult
 from slviewer.pipeline.mesh import mesh as mesh_merge
-from slviewer.pipeline.models import ModelName, check_accepted, load_model, load_stereo_if_complete, preferred_model
+from slviewer.pipeline.models import ModelName, check_accepted, load_model, load_stereo_if_complete
 from slviewer.pipeline.open_session import opened_or_made
 from slviewer.pipeline.operation import Findings
 from slviewer.pipeline.rig_choice import RigSetup, SetUp, set_up
@@ -126,15 +125,14 @@ def turn(
     with opened_or_made(session) as store:
         if merge:  # refused before anything turns
             check_accepted(store, accept_rejected)
-            load_model(store, model or preferred_model(store))
+            load_model(store, model)
         todo = missing_steps(store, name) if resume else plan_turn(name or next_turn(store), steps, range_deg)
-        if taken := {step.name for step in todo} & set(store.taken_names()):
+        if taken := set(store.taken_names()).intersection(step.name for step in todo):
             raise InputError(f"there is a capture {min(taken)!r} already: choose another name, or resume the turn")
-        choice = rig if isinstance(rig, Mapping) else load_rig(rig, store)
-        patterns = patterns or str(store.decision("patterns") or DEFAULT_PATTERNS)
+        choice = load_rig(rig, store)
         if choice.get("driver") == "replay":
             raise InputError("a recording cannot be turned: choose a rig with a turntable")
-        check_patterns(patterns)
+        patterns = choose_patterns(store, choice, patterns)
         progress(0.0, "opening the devices")
         bench = set_up(choice, None)
         require_turntable(bench.rig)
@@ -151,16 +149,14 @@ def turn(
                 captured = capture_with_texture(
                     devices, sequence, exposures, progress=lambda done, n: progress(done / n, f"frame {done} of {n}")
                 )
-                save_frames(
-                    store, step.name, "scan", sequence, captured, source=devices.name, purpose="scan", turn_step=step
-                )
+                save_frames(store, step.name, "scan", captured, turn_step=step)
 
             capture_turn(devices, todo, capture_step, recorded_steps(store, todo[0].turn), part(progress, 0, 0.5), warn)
-        captures = tuple(store.load_capture(step.name) for step in recorded_steps(store, todo[0].turn))
+        names = [step.name for step in recorded_steps(store, todo[0].turn)]
+        captures = tuple(map(store.load_capture, names))
         if not merge:
             progress(1.0, "captured")
             return Turn(captures)
-        names = [capture.name for capture in captures]
         settings = MergeSettings(names, names[0], model=model, accept_rejected=accept_rejected)
         merged = merge_turn(store, settings, part(progress, 0.5, 0.8), warn)
         out = mesh if mesh is not None else store.exports / f"{todo[0].turn}_mesh.ply"

@@ -7,7 +7,7 @@ from typing import ClassVar
 import numpy as np
 
 from slviewer.errors import InputError, UsageError
-from slviewer.evaluation.compare import Comparison, compare
+from slviewer.evaluation.compare import Comparison, fit_clouds
 from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis
 from slviewer.pipeline.capture_clouds import capture_cloud, check_capture_sizes
@@ -117,7 +117,7 @@ def compare_captures(job: Job, settings: VerifySettings, chosen: Mapping[str, Mo
             region = segment_board(store, shot, capture_texture(shot, frames), job.warn)
         lit = illuminated_pixels(phases, clouds)
         try:
-            found = compare(settings.shape, clouds, lit, region=region, depth_range=depths, radius=settings.radius)
+            found = fit_clouds(settings.shape, clouds, lit, region=region, depth_range=depths, radius=settings.radius)
         except InputError as error:
             raise InputError(f"{shot.name}: {error}") from error
         for message in found.warnings:

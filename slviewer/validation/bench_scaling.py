@@ -21,6 +21,7 @@ from slviewer.fringe.sequence import one_axis
 from slviewer.pipeline.batch import batch
 from slviewer.pipeline.capture_phases import decode_frames, texture_8bit
 from slviewer.pipeline.feedback import Progress, ignore_progress
+from slviewer.pipeline.pose_evidence import DecodedPose
 from slviewer.pipeline.poses import read_pose
 from slviewer.pipeline.simulate import TARGET
 from slviewer.reconstruction.cloud import Cloud
@@ -169,7 +170,9 @@ def _time_poses(rig: SimulatedRig, plan: dict[str, Any]) -> list[Row]:
     for name in (name for name in plan if name.startswith("pose_")):
         frames = Renderer(rig, plan[name]).capture(sequence)
         phases = decode_frames(name, sequence, frames)
-        read = read_pose(name, sequence, frames, phases, texture_8bit(sequence, frames), board, Smoothing())
+        read = read_pose(
+            DecodedPose(name, sequence, frames, phases, texture_8bit(sequence, frames), board), Smoothing()
+        )
         if read.observation is not None:
             observations.append(read.observation)
 

@@ -19,6 +19,7 @@ from slviewer.fringe.patterns import profile
 from slviewer.fringe.presets import AXES, gray_bits, phase_steps
 from slviewer.fringe.sequence import Axis, Frame, PatternSequence
 from slviewer.pipeline.capture_phases import decode_frames
+from slviewer.pipeline.pose_evidence import DecodedPose
 from slviewer.pipeline.poses import Judged, read_pose
 from slviewer.simulation.boards import BoardShape, Pose, printed_board
 from slviewer.simulation.hostile_frames import delay_frames, drop_frame, show_instead
@@ -91,7 +92,8 @@ class FaultBench:
         """Read a capture with its evidence; ``sequence`` and ``board`` as described to the program."""
         name, sequence, board = f"pose_{i + 1:02d}", sequence or self.sequence, board or self.board
         phases = decode_frames(name, sequence, frames)
-        return read_pose(name, sequence, frames, phases, texture(sequence, frames), board, Smoothing(), examine=True)
+        pose = DecodedPose(name, sequence, frames, phases, texture(sequence, frames), board)
+        return read_pose(pose, Smoothing(), examine=True)
 
     def examine_clean(self, count: int | None = None) -> list[Judged]:
         """Read all captures, or the first ``count``, without a fault; cached."""

@@ -17,7 +17,7 @@ from slviewer.fringe.residual import capture_residuals
 from slviewer.fringe.sequence import Frame, PatternSequence
 from slviewer.pipeline.calibrate import calibrate
 from slviewer.pipeline.calibration_verdict import load_last_verdict
-from slviewer.pipeline.import_captures import import_frames
+from slviewer.pipeline.import_captures import import_captures
 from slviewer.pipeline.operation import Job
 from slviewer.pipeline.reconstruct import ReconstructSettings, reconstruct_capture
 from slviewer.pipeline.verify import VerifySettings, verify
@@ -132,7 +132,8 @@ class HostileBench:
             toml = source / "sequence.toml"
             toml.write_text(describe_sequence(self.sequence, files[0]))
             try:
-                import_frames(source, session, toml, role=role, force=True, warn=report.warnings.append)  # type: ignore[arg-type]
+                warn = report.warnings.append
+                import_captures(source, session, "frames", sequence=toml, role=role, force=True, warn=warn)  # type: ignore[arg-type]
             except SlviewerError as error:
                 report.named += named_causes(self.sequence, captures, [*report.warnings, str(error)])
                 raise

@@ -17,7 +17,7 @@ import numpy as np
 from slviewer.calibration.observe import Observation
 from slviewer.calibration.pixelwise import calibrate_pixelwise
 from slviewer.errors import InputError
-from slviewer.evaluation.compare import Comparison, compare
+from slviewer.evaluation.compare import Comparison, fit_clouds
 from slviewer.evaluation.letter import DEPTH_RANGE_MM, SPHERE_RADIUS_MM
 from slviewer.evaluation.plane import evaluate_plane
 from slviewer.evaluation.render import Row
@@ -288,7 +288,7 @@ def compare_fits(
         points = model.points(phase)
         sigma = model.sigma_z(phase, points)
         clouds[name] = Cloud(np.where(covered[..., None], points, np.float32(np.nan)), phase.axis, name, sigma)
-    comparison = compare(
+    comparison = fit_clouds(
         "sphere" if is_sphere else "plane",
         {name: clouds[name] for name in JUDGED},
         phase.illuminated,

@@ -59,21 +59,11 @@ class CaptureRequests(ResultRequests):
         engine, store, target = self._engine, self._engine.store, self._engine.reader.target()
         if not target:
             raise InputError("choose the target first: a pose is judged by it")
-        sequence, source = pose_sequence(engine), engine.acquisition.view().name
+        sequence = pose_sequence(engine)
 
         def save(captured: CapturedFrames) -> None:
             """Save the captured frames as a target pose; a retaken pose is included again."""
-            save_frames(
-                store,
-                name,
-                "calibration",
-                sequence,
-                captured,
-                source=source,
-                purpose="pose",
-                board=target,
-                force=retake,
-            )
+            save_frames(store, name, "pose", captured, board=target, force=retake)
             if retake and name in store.excluded():
                 store.include(name)
 
@@ -83,11 +73,11 @@ class CaptureRequests(ResultRequests):
         """Queue the capture of a scan, plane or sphere; `follow(name)` is called once it is saved."""
         engine, store = self._engine, self._engine.store
         sequence = scan_sequence(engine)
-        name, source = self._next_name(purpose), engine.acquisition.view().name
+        name = self._next_name(purpose)
 
         def save(captured: CapturedFrames) -> None:
             """Save the captured frames as a scan, with the operator's label."""
-            save_frames(store, name, "scan", sequence, captured, source=source, purpose=purpose)
+            save_frames(store, name, purpose, captured)
             self._set_label(name, label)
 
         self._queue_capture(name, sequence, save, lambda: follow(name))

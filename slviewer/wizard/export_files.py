@@ -2,7 +2,8 @@
 
 from slviewer.pipeline.export import What, default_file_name, export
 from slviewer.pipeline.feedback import Warn
-from slviewer.pipeline.mesh import MERGE, mesh
+from slviewer.pipeline.measured_surface import MERGED
+from slviewer.pipeline.mesh import mesh
 from slviewer.pipeline.models import accepts_rejected
 from slviewer.session.store import Session
 from slviewer.surface.meshing import MeshingPlan
@@ -33,7 +34,7 @@ def export_file(
             )
         words = exported.words
     else:
-        source = f"{MERGE}{name}" if what == "merged-mesh" else name
+        source = f"{MERGED}{name}" if what == "merged-mesh" else name
         path = session.exports / default_file_name(what, name, file_format)
         made = mesh(
             session, [source], path, plan=plan, texture=texture, white=white, accept_rejected=accepts,

@@ -51,9 +51,8 @@ class LiveRequests(CaptureRequests):
             raise InputError("no live scan runs: start one, and wait for a cloud")
         name = self._next_name("scan")
         self._check_space(name, len(shot.frames))
-        captured = CapturedFrames(shot.frames, shot.settings)
         source = engine.acquisition.view().name
-        save_frames(store, name, "scan", live.stream.sequence, captured, source=source, purpose="scan")
+        save_frames(store, name, "scan", CapturedFrames(shot.frames, shot.settings, live.stream.sequence, source))
         self._set_label(name, label)
         engine.queue_processing()
         self._finish_scan(name)

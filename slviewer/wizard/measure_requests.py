@@ -18,7 +18,7 @@ from slviewer.pipeline.plan import TOLERANCE_MM, make_plan
 from slviewer.session import atomic
 from slviewer.session.atomic import rename
 from slviewer.session.inspection_plan import OWN_PLAN, PLANS, list_plans, read_plan, write_plan
-from slviewer.session.measurements import Measurement
+from slviewer.session.measurements import Measurement, rename_measurement, restore_measurement, trash_measurement
 from slviewer.session.names import safe_name
 from slviewer.session.nominal import NOMINALS, Units, read_nominal
 from slviewer.session.store import Session
@@ -187,17 +187,17 @@ class MeasureRequests(RequestHandler):
     @request("Renaming")
     def relabel_measurement(self, identity: str, name: str) -> None:
         """Rename a measurement; an empty name restores its original name."""
-        measurements.relabel_measurement(self._engine.store, identity, name)
+        rename_measurement(self._engine.store, identity, name)
 
     @request("Deleting")
     def delete_measurement(self, identity: str) -> None:
         """Move a measurement to the trash; results made from it are stale until it is restored."""
-        measurements.delete_measurement(self._engine.store, identity)
+        trash_measurement(self._engine.store, identity)
 
     @request("Restoring")
     def undo_delete(self) -> None:
         """Restore the measurement that was deleted last."""
-        measurements.undo_delete(self._engine.store)
+        restore_measurement(self._engine.store)
 
     @request("Writing the table")
     def export_measurements_table(self) -> None:

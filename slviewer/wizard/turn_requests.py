@@ -63,9 +63,7 @@ class TurnRequests(CaptureRequests, MergeRequests):
                 captured = capture_with_texture(
                     rig, sequence, exposures, buffer, lambda done, n: progress(done / n, f"frame {done} of {n}")
                 )
-                save_frames(
-                    store, step.name, "scan", sequence, captured, source=rig.name, purpose="scan", turn_step=step
-                )
+                save_frames(store, step.name, "scan", captured, turn_step=step)
                 engine.queue_processing()
                 self._finish_scan(step.name)
 

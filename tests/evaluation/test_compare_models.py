@@ -9,7 +9,7 @@ from planted import board_before_a_wall, cloud, plane_depth, rectangle, sphere_d
 
 from slviewer.errors import InputError
 from slviewer.evaluation import letter
-from slviewer.evaluation.compare import Comparison, compare
+from slviewer.evaluation.compare import Comparison, fit_clouds
 from slviewer.evaluation.incidence import incidence
 from slviewer.evaluation.render import render
 from slviewer.evaluation.tables import letter_rows
@@ -32,7 +32,7 @@ def two() -> tuple[dict[str, Cloud], np.ndarray, Comparison]:
     illuminated = board.copy()
     illuminated[:, 300:] = False
     clouds = {"stereo": seen(first, "stereo", 0.10), "pixelwise": seen(second, "pixelwise")}
-    return clouds, board, compare("plane", clouds, illuminated, depth_range=(590.0, 610.0))
+    return clouds, board, fit_clouds("plane", clouds, illuminated, depth_range=(590.0, 610.0))
 
 
 def test_every_model_is_measured_over_the_common_pixels(two: tuple[dict[str, Cloud], np.ndarray, Comparison]) -> None:
@@ -59,7 +59,7 @@ def test_a_larger_wall_that_one_model_alone_measures_is_not_the_shape() -> None:
         clouds = dict(
             list({"stereo": seen(everywhere, "stereo"), "pixelwise": seen(near, "pixelwise")}.items())[::order]
         )
-        result = compare("plane", clouds, board)
+        result = fit_clouds("plane", clouds, board)
         assert not result.region[~board].any()
         assert result.region.sum() > 0.9 * board.sum()
         assert result.results["stereo"].points == result.results["pixelwise"].points == 130 * 130
@@ -69,14 +69,14 @@ def test_a_larger_wall_that_one_model_alone_measures_is_not_the_shape() -> None:
 def test_a_given_region_is_taken_as_it_is() -> None:
     points, board = board_before_a_wall()
     points[40:60, 60:90] = np.nan
-    result = compare("plane", {"stereo": seen(points, "stereo")}, board, region=board)
+    result = fit_clouds("plane", {"stereo": seen(points, "stereo")}, board, region=board)
     assert result.results["stereo"].points == board.sum() - 600
     assert result.coverage["stereo"] == pytest.approx(1 - 600 / board.sum())
 
 
 def test_what_is_not_known_is_none_in_json() -> None:
     points, _ = board_before_a_wall()
-    record = compare("plane", {"stereo": seen(points, "stereo")}).record()
+    record = fit_clouds("plane", {"stereo": seen(points, "stereo")}).record()
     figures = json.loads(json.dumps(to_plain(record)))
     assert figures["incidence"] is None
     assert figures["models"]["stereo"]["coverage"] is None
@@ -90,18 +90,18 @@ def test_models_without_common_pixels_are_refused() -> None:
     left[:, 180:] = np.nan
     right[:, :180] = np.nan
     with raises(InputError, "left"):
-        compare("plane", {"left": seen(left, "left"), "right": seen(right, "right")}, region=board)
+        fit_clouds("plane", {"left": seen(left, "left"), "right": seen(right, "right")}, region=board)
     with raises(InputError, "left", "right", 0):
-        compare("plane", {"left": seen(left, "left"), "right": seen(right, "right")})
+        fit_clouds("plane", {"left": seen(left, "left"), "right": seen(right, "right")})
     with pytest.raises(InputError):
-        compare("plane", {"left": seen(left, "left"), "right": seen(right[:100], "right")})
+        fit_clouds("plane", {"left": seen(left, "left"), "right": seen(right[:100], "right")})
     with pytest.raises(InputError):
-        compare("plane", {})
+        fit_clouds("plane", {})
 
 
 def test_a_sphere_reports_its_radius() -> None:
     points = cloud(sphere_depth((0.0, 0.0, 650.0), 98.0), 0.04)
-    result = compare("sphere", {"stereo": seen(points, "stereo", 0.04)}, radius=98.0)
+    result = fit_clouds("sphere", {"stereo": seen(points, "stereo", 0.04)}, radius=98.0)
     assert result.record().models["stereo"].radius_mm == pytest.approx(98.0, abs=0.01)
     (table,) = Verification.tables({"ball": result.record()})
     assert "98.0" in render_text(table)
@@ -160,7 +160,7 @@ def test_tables_show_the_letters_figures_beside_ours(two: tuple[dict[str, Cloud]
 def test_sphere_tables_hold_radii() -> None:
     points = cloud(sphere_depth((0.0, 0.0, 650.0), 98.0), 0.04)
     clouds = {"stereo": seen(points, "stereo"), "pixelwise": seen(points, "pixelwise")}
-    comparison = compare("sphere", clouds, radius=98.0)
+    comparison = fit_clouds("sphere", clouds, radius=98.0)
     table = letter_rows({"sphere_2": comparison, "sphere_7": comparison})
     assert table[0]["Letter pixelwise radius"] == 98.00
     assert "Letter stereo" not in table[1]
@@ -179,7 +179,7 @@ def test_nothing_to_show_renders_as_nothing() -> None:
 
 def test_a_plane_far_off_the_depths_is_all_in_one_range() -> None:
     points = cloud(plane_depth(440.0), 0.02)
-    result = compare("plane", {"stereo": seen(points, "stereo")}, depth_range=letter.DEPTH_RANGE_MM)
+    result = fit_clouds("plane", {"stereo": seen(points, "stereo")}, depth_range=letter.DEPTH_RANGE_MM)
     assert result.incidence == {"R1": 100.0, "R2": 0.0, "R3": 0.0}
 
 
@@ -188,20 +188,20 @@ def test_a_plane_that_is_a_minor_part_of_the_scene_is_told_with_its_place() -> N
     u = np.arange(board.shape[1])[None, :]
     rough = plane_depth(900.0) + 40.0 * np.sin(u / 6.0)
     points = cloud(np.where(board, plane_depth(), rough), 0.05)
-    result = compare("plane", {"stereo": seen(points, "stereo")}, np.ones(board.shape, bool))
+    result = fit_clouds("plane", {"stereo": seen(points, "stereo")}, np.ones(board.shape, bool))
     assert 0.0 < result.share < 0.5 and result.record().share == result.share
     place = f"{100 * result.share:.0f} %", result.region_text()
     assert [missing_facts(warning, *place) for warning in result.warnings].count([]) == 1
     rows, columns = (np.flatnonzero(result.region.any(axis=axis)) for axis in (1, 0))
     assert missing_facts(result.region_text(), columns[0], columns[-1], rows[0], rows[-1]) == []
-    given = compare("plane", {"stereo": seen(points, "stereo")}, region=board)
+    given = fit_clouds("plane", {"stereo": seen(points, "stereo")}, region=board)
     assert all(missing_facts(warning, given.region_text()) for warning in given.warnings)  # it was not searched for
 
 
 def test_an_rms_far_above_the_floor_by_every_model_is_told() -> None:
     v = np.arange(plane_depth().shape[0])[:, None]
     bent = cloud(plane_depth() + 0.6 * np.sin(v / 10.0), 0.05)
-    result = compare("plane", {"stereo": seen(bent, "stereo"), "splined": seen(bent, "splined")})
+    result = fit_clouds("plane", {"stereo": seen(bent, "stereo"), "splined": seen(bent, "splined")})
     ratios = {name: each.rms_mm / each.noise_floor_mm for name, each in result.results.items()}
     best = min(ratios, key=lambda name: ratios[name])
     facts = "noise floor", "plane", f"{ratios[best]:.1f}", best

@@ -22,6 +22,7 @@ from slviewer.pipeline import measurements
 from slviewer.pipeline.measured_surface import MeasuredSurface, load_surface
 from slviewer.pipeline.report import report
 from slviewer.pipeline.simulate import save_true_stereo
+from slviewer.session.measurements import rename_measurement, restore_measurement, trash_measurement
 from slviewer.session.ply import read_ply, write_ply
 from slviewer.session.store import Session
 from slviewer.simulation.assets import asset
@@ -130,28 +131,31 @@ def test_measurements_are_renamed_deleted_and_brought_back(folder, balls, tops) 
     a, b = tops
     one = measurements.add_distance(folder, balls, a, b)
     assert one.name == "distance 1"
-    assert measurements.relabel_measurement(folder, one.id, "=width").name == "=width"
-    assert ",'=width," in measurements.measurements_csv(folder).replace("m1,'", "m1,'")  # no formula for a spreadsheet
-    assert measurements.relabel_measurement(folder, one.id, "").name == "distance 1"
-    two = measurements.add_distance(folder, balls, b, a, "back")
-    measurements.delete_measurement(folder, two.id)
-    three = measurements.add_distance(folder, balls, a, b)
-    assert three.id == "m3"  # an id that was deleted can come back
-    assert measurements.undo_delete(folder).name == "back"
-    assert [each.id for each in measurements.load_measurements(folder)] == ["m1", "m2", "m3"]
-    with raises(InputError):
-        measurements.undo_delete(folder)
-    with raises(InputError, "'m9'", "m1", "m2", "m3"):
-        measurements.relabel_measurement(folder, "m9", "x")
+    with Session.open(folder, write=True) as store:
+        assert rename_measurement(store, one.id, "=width").name == "=width"
+        assert ",'=width," in measurements.measurements_csv(store).replace("m1,'", "m1,'")  # no formula in a table
+        assert rename_measurement(store, one.id, "").name == "distance 1"
+        two = measurements.add_distance(store, balls, b, a, "back")
+        trash_measurement(store, two.id)
+        three = measurements.add_distance(store, balls, a, b)
+        assert three.id == "m3"  # an id that was deleted can come back
+        assert restore_measurement(store).name == "back"
+        assert [each.id for each in measurements.load_measurements(store)] == ["m1", "m2", "m3"]
+        with raises(InputError):
+            restore_measurement(store)
+        with raises(InputError, "'m9'", "m1", "m2", "m3"):
+            rename_measurement(store, "m9", "x")
 
 
 @pytest.mark.slow
 def test_a_measurement_is_stale_when_its_scan_or_what_it_was_made_from_changed(folder, balls, regions) -> None:
     fits = [measurements.add_fit(folder, balls, "sphere", ball_about(balls, region)) for region in regions]
     measurements.add_relation(folder, fits[0].id, fits[1].id)
-    measurements.delete_measurement(folder, fits[1].id)
+    with Session.open(folder, write=True) as store:
+        trash_measurement(store, fits[1].id)
     assert [each.stale for each in measurements.load_measurements(folder)] == [False, True]
-    measurements.undo_delete(folder, fits[1].id)
+    with Session.open(folder, write=True) as store:
+        restore_measurement(store, fits[1].id)
     assert not any(each.stale for each in measurements.load_measurements(folder))
     with Session.open(folder, write=True) as store:
         other = store.load_capture("object")

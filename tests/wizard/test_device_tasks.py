@@ -112,7 +112,7 @@ def test_a_capture_in_several_exposures_is_saved_whole(bench: Bench, tmp_path: P
             CaptureRequest(
                 "pose_01",
                 SEQUENCE,
-                lambda taken: save_frames(store, "pose_01", "calibration", SEQUENCE, taken, source="x", purpose="pose"),
+                lambda taken: save_frames(store, "pose_01", "pose", taken),
                 lambda: None,
                 (4.0, 0.5),
             )
@@ -147,7 +147,7 @@ def test_a_colour_camera_leaves_its_texture_in_the_session(bench: Bench, tmp_pat
             CaptureRequest(
                 "scan_01",
                 SEQUENCE,
-                lambda taken: save_frames(store, "scan_01", "scan", SEQUENCE, taken, source="x", purpose="scan"),
+                lambda taken: save_frames(store, "scan_01", "scan", taken),
                 lambda: None,
             )
         )
