@@ -9,7 +9,7 @@ import viser
 
 from slviewer.gui.inputs import Choice, change
 from slviewer.gui.measure_drawing import drawn, label, lifted
-from slviewer.gui.measure_html import deviation_figure, measurement_html, measurements_table, verdict_html
+from slviewer.gui.measure_html import deviation_figure, deviation_html, measurement_html, measurements_table
 from slviewer.gui.measure_section import CURSORS, SectionPlot, cursor_points
 from slviewer.gui.panel import PanelContext
 from slviewer.gui.pictures import PLOT_PX, Painter, Plot
@@ -164,7 +164,7 @@ class MeasurementList:
             self._histogram.hide()
             self._verdict.set("")
             return
-        self._verdict.set(verdict_html(measured.data))
+        self._verdict.set(deviation_html(measured.data))
         verdict = measured.data["verdict"]
         tolerance = None if verdict is None else float(verdict["tolerance_mm"])
 

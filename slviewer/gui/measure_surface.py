@@ -117,7 +117,7 @@ class SurfaceView:
             """Load the surface; returns (surface, points, colours, legend)."""
             on = context.operator.surface(name)
             if shown is None:
-                return (on, *painting(on, COLOURS[0] if colour == DEVIATION else colour))
+                return (on, *paint_surface(on, COLOURS[0] if colour == DEVIATION else colour))
             arrays = measurement_arrays(context.session, shown.id)
             return (on, *_colour_by_deviation(arrays, shown))
 
@@ -141,7 +141,7 @@ class SurfaceView:
             self._context.viewpoints.show(f"{self._layer} {self.on.source}", self.on.points)
 
 
-def painting(on: MeasuredSurface, colour: str) -> tuple[np.ndarray, np.ndarray, Html]:
+def paint_surface(on: MeasuredSurface, colour: str) -> tuple[np.ndarray, np.ndarray, Html]:
     """Colour a surface by one of COLOURS: (points (..., 3), their colours (..., 3), the legend)."""
     if colour == "texture" and on.texture is not None:
         return on.points, on.texture, Html("")

@@ -78,7 +78,8 @@ class Shell:
         self._gui, self._context = context.gui, context
         self._devices = DeviceLayer(context.scene)
         self._panels: dict[str, StepPanel] = {
-            step.key: importlib.import_module(f"slviewer.gui.steps.{step.key}").Panel(context) for step in steps
+            key: getattr(importlib.import_module(f"slviewer.gui.steps.{key}"), f"{key.title()}Panel")(context)
+            for key in (step.key for step in steps)
         }
         self._shown_key = self._autopilot_key = ""
         self.current = next((s.key for s in steps if s.state != "done"), steps[0].key)

@@ -10,8 +10,8 @@ from slviewer.report.canvas import (
     INK,
     REGIONS,
     SMALL_PT,
+    add_legend,
     finish_figure,
-    legend,
     model_colour,
     new_figure,
     style_axes,
@@ -66,7 +66,7 @@ def rms_bars(rows: Sequence[PlaneRow]) -> Figure:
                 )
     handles, labels = upper.get_legend_handles_labels()
     order = sorted(range(len(labels)), key=lambda i: labels[i] not in models)  # models first
-    legend(
+    add_legend(
         upper,
         handles=[handles[i] for i in order],
         labels=[labels[i] for i in order],
@@ -88,7 +88,7 @@ def rms_bars(rows: Sequence[PlaneRow]) -> Figure:
     lower.set_yticks([])
     lower.set_xlim(-0.6, len(rows) - 0.4)
     lower.set_xticks(at, [row.name for row in rows], fontsize=SMALL_PT, rotation=45 if len(rows) > 14 else 0)
-    legend(lower, loc="center left", bbox_to_anchor=(1.0, 0.5), reverse=True, handlelength=1.0)
+    add_legend(lower, loc="center left", bbox_to_anchor=(1.0, 0.5), reverse=True, handlelength=1.0)
     return finish_figure(
         drawing,
         "RMS distance of the flat board from its own plane, by model. Black ticks: what the capture's noise alone "

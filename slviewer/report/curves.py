@@ -3,7 +3,7 @@
 import numpy as np
 
 from slviewer.errors import InputError
-from slviewer.report.canvas import FULL, HALF, INK, MODELS, SOFT, finish_figure, legend, new_figure, style_axes
+from slviewer.report.canvas import FULL, HALF, INK, MODELS, SOFT, add_legend, finish_figure, new_figure, style_axes
 from slviewer.report.data import PixelCurve
 from slviewer.report.page import Figure
 
@@ -59,10 +59,10 @@ def pixel_curves(curve: PixelCurve, *, width: int = FULL) -> Figure:
             reach = 1.25 * max(float(np.abs(residuals).max()), 1.0)
             lower.set_ylim(-reach, reach)
             if not narrow:
-                legend(upper, loc="best", title=f"RMS {1e3 * rms:.0f} µm", title_fontsize=8.6, alignment="left")
+                add_legend(upper, loc="best", title=f"RMS {1e3 * rms:.0f} µm", title_fontsize=8.6, alignment="left")
                 upper.get_legend().get_title().set_color(INK)
             elif i == 0:
-                legend(upper, loc="best")
+                add_legend(upper, loc="best")
         lower.axhline(0, color=SOFT, linewidth=0.8)
     u, v = curve.pixel
     listed = ", ".join(f"{name} {1e3 * rms:.0f} µm" for name, rms in zip("zxy", curve.rms_mm, strict=True))

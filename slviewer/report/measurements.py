@@ -16,9 +16,9 @@ from slviewer.report.canvas import (
     FULL,
     SOFT,
     TEXT_PT,
-    colour_bar,
+    add_colour_bar,
+    add_legend,
     finish_figure,
-    legend,
     new_figure,
     round_up,
     style_axes,
@@ -210,7 +210,7 @@ def draw_deviations(axes: Any, edges: np.ndarray, counts: np.ndarray, limit: flo
         for side in (-tolerance, tolerance):
             axes.axvline(side, color=TOLERANCE, linewidth=1.2, linestyle="--")
         axes.plot([], [], color=TOLERANCE, linewidth=1.2, linestyle="--", label=f"tolerance ± {tolerance:g} mm")
-        legend(axes, loc="lower right", bbox_to_anchor=(1, 1.0), borderaxespad=0.2)
+        add_legend(axes, loc="lower right", bbox_to_anchor=(1, 1.0), borderaxespad=0.2)
 
 
 def draw_deviation(view: Measurement, arrays: Mapping[str, np.ndarray]) -> Figure:
@@ -239,7 +239,7 @@ def draw_deviation(view: Measurement, arrays: Mapping[str, np.ndarray]) -> Figur
         render_points(points, normals, colours, (DENSITY * width, DENSITY * height), view_rotation(YAW_DEG, PITCH_DEG))
     )
     mapped = ScalarMappable(Normalize(-limit, limit), palette)
-    colour_bar(drawing, mapped, left, "deviation, mm", location="bottom", shrink=0.7, aspect=40, pad=0.02)
+    add_colour_bar(drawing, mapped, left, "deviation, mm", location="bottom", shrink=0.7, aspect=40, pad=0.02)
     numbers = view.data["statistics_mm"]
     style_axes(right, f"RMS {numbers['rms']:.4f} mm", "deviation, mm", "points, %")
     edges = arrays["edges"]

@@ -7,7 +7,16 @@ import numpy as np
 
 from slviewer.fringe.phase import PhaseMap, Reason
 from slviewer.fringe.sequence import Axis
-from slviewer.report.canvas import DENSITY, FULL, INK, SMALL_PT, colour_bar, finish_figure, new_figure, style_image_axes
+from slviewer.report.canvas import (
+    DENSITY,
+    FULL,
+    INK,
+    SMALL_PT,
+    add_colour_bar,
+    finish_figure,
+    new_figure,
+    style_image_axes,
+)
 from slviewer.report.page import Figure
 
 REASON_LABELS = {
@@ -55,7 +64,9 @@ def phase_maps(title: str, phases: Mapping[Axis, PhaseMap], *, width: int = FULL
         for code, colour in REASON_COLOURS.items():
             cover[reason == code] = (*to_rgb(colour), 1.0)
         axes.imshow(cover, aspect="equal", interpolation="nearest")
-        colour_bar(drawing, image, axes, f"projector {'column' if axis == 'x' else 'row'}, px", orientation="vertical")
+        add_colour_bar(
+            drawing, image, axes, f"projector {'column' if axis == 'x' else 'row'}, px", orientation="vertical"
+        )
         patches = [
             Patch(
                 facecolor=colour,

@@ -33,12 +33,12 @@ from slviewer.wizard.acquisition import Acquisition
 from slviewer.wizard.diagnostics import LogKeeper
 from slviewer.wizard.jobs import Jobs, Reporter
 from slviewer.wizard.live_scan import LiveCloud, LiveScan
-from slviewer.wizard.notices import Notices, describe_error
+from slviewer.wizard.notices import Notices, describe_failure
 from slviewer.wizard.planner import Planner
-from slviewer.wizard.pose_plan import plan
+from slviewer.wizard.pose_plan import plan_next_pose
 from slviewer.wizard.preview_watcher import HandsFree, Watch, Watcher
 from slviewer.wizard.publisher import Listeners, Publisher
-from slviewer.wizard.result_views import thumbnail
+from slviewer.wizard.result_views import make_thumbnail
 from slviewer.wizard.session_reader import SessionReader
 from slviewer.wizard.snapshot import (
     Brightness,
@@ -87,7 +87,7 @@ class Engine:
         self.publisher = Publisher(self._build_snapshot, empty, timing.retry_s)
         self.notices = Notices(self.publisher.mark_changed)
         self.jobs = Jobs(self.notices, self.publisher.mark_changed)
-        compute = partial(plan, trials=timing.trials)
+        compute = partial(plan_next_pose, trials=timing.trials)
         self._planner = Planner(lambda: self.publisher.mark_changed(session=True), compute)
         self.watcher = Watcher(self._handle_preview)
         self.acquisition = Acquisition(
@@ -311,7 +311,7 @@ class Engine:
         if capture.name not in reader.session.capture_names():
             return  # deleted since
         if not reader.has_thumbnail(capture):
-            reader.add_thumbnail(capture, thumbnail(capture))
+            reader.add_thumbnail(capture, make_thumbnail(capture))
             self.publisher.mark_changed(session=True)
         session = reader.session.guarded(report.saving)
         report(0.0, f"reading {capture.name}")
@@ -374,14 +374,14 @@ class Engine:
             try:
                 session = reader.read(rig, bench.focal_px if bench else None)
             except Exception as error:  # most likely files were being changed
-                read_failure = describe_error("Reading the session", error)
+                read_failure = describe_failure("Reading the session", error)
         space = None
         try:
             if reader is not None:
                 camera = bench.rig.camera if bench is not None and rig.camera is not None else None
                 space = measure_space(reader.session, camera, reader.count_frames(rig))
         except (SlviewerError, OSError) as error:
-            read_failure = read_failure or describe_error("Reading the session", error)
+            read_failure = read_failure or describe_failure("Reading the session", error)
         if self._rig_fault:
             rig = replace(rig, state="lost", fault=self._rig_fault)
         world = None

@@ -44,7 +44,7 @@ from slviewer.session.store import Session
 from slviewer.target.board import Board
 from slviewer.wizard.calibration_views import load_fit_rms, load_splined
 from slviewer.wizard.export_files import list_exports
-from slviewer.wizard.notices import describe_error
+from slviewer.wizard.notices import describe_failure
 from slviewer.wizard.planner import Planner
 from slviewer.wizard.pose_plan import PlanInput, PoseFeatures, PosePlan
 from slviewer.wizard.snapshot import (
@@ -208,7 +208,7 @@ class SessionReader:
         try:
             return read()
         except Exception as error:  # damaged files may make their reader fail in any way
-            self._faults.append(describe_error(f"Reading {what}", error))
+            self._faults.append(describe_failure(f"Reading {what}", error))
             return otherwise
 
     # poses

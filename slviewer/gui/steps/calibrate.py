@@ -35,7 +35,7 @@ USUAL_WEIGHT = "80 % or more is usual"
 _MOST_NAMED = 6  # poses of a verdict that are offered as buttons: they fit on two lines
 
 
-class Panel(StepPanel):
+class CalibratePanel(StepPanel):
     """Panel of the step Calibrate."""
 
     key = "calibrate"
@@ -341,7 +341,9 @@ class Panel(StepPanel):
             return
         self._refresh()
         context = self._context
-        self._painter.request("cloud", name, lambda: result_views.scan_cloud(context.session, name), self._draw_cloud)
+        self._painter.request(
+            "cloud", name, lambda: result_views.load_scan_cloud(context.session, name), self._draw_cloud
+        )
 
     def _draw_cloud(self, cloud: result_views.ScanCloud) -> None:
         """Draw a cloud, coloured by depth, to choose pixels on."""

@@ -107,7 +107,7 @@ class MeshInputs:
         return MeshingPlan(method, sizes.get(holes), self.triangles, SMOOTHING[self._smooth.value], holes == CLOSED)
 
 
-class Panel(StepPanel):
+class ExportPanel(StepPanel):
     """Panel of the step Export."""
 
     key = "export"
@@ -261,7 +261,7 @@ class Panel(StepPanel):
             if name == MERGED:
                 whole = result_views.merged_cloud(context.session, merge)
                 return whole.points, whole.colours
-            cloud = result_views.scan_cloud(context.session, name)
+            cloud = result_views.load_scan_cloud(context.session, name)
             return cloud.points, cloud.texture
 
         key: Any = merge if name == MERGED else clouds.get(name)

@@ -29,7 +29,7 @@ _MARKERS_NOTE = (
 _CURRENT_NOTE = "For scans between which neither the object nor the camera moved, or hardly."
 
 
-class Panel(StepPanel):
+class MergePanel(StepPanel):
     """Panel of the step Merge."""
 
     key = "merge"

@@ -67,7 +67,7 @@ def _draw_field(count: int, width: int, height: int, mark: str = "") -> str:
     return f'<div style="{style};line-height:{height}px;text-align:center">{mark}</div>'
 
 
-class Panel(StepPanel):
+class PosesPanel(StepPanel):
     """Panel of the step Poses."""
 
     key = "poses"

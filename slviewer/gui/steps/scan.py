@@ -51,7 +51,7 @@ LIVE_HINT = "Continuous clouds of 11 frames each: faster and noisier than a capt
 _STATES = {"absent": "not reconstructed", "fresh": "", "stale": "older calibration"}
 
 
-class Panel(StepPanel):
+class ScanPanel(StepPanel):
     """Panel of the step Scan."""
 
     key = "scan"
@@ -327,7 +327,7 @@ class Panel(StepPanel):
             return
         is_new = whole is not self._whole
         self._whole, self._cloud = whole, cloud
-        painted, bar = painting(cloud, colour)
+        painted, bar = paint_cloud(cloud, colour)
         (points,) = self._editing.set_scans([(cloud, None)])
         shown = self._scene.cloud(LAYER, "cloud", points, painted)
         self._scene.show(LAYER, self._visible)
@@ -389,7 +389,7 @@ def live_html(live: LiveView, shown: int) -> Html:
     return Html(paragraph(Html(html)) + paragraph(coloured(note, "dim")))
 
 
-def painting(cloud: ScanCloud, colour: str) -> tuple[np.ndarray, Html]:
+def paint_cloud(cloud: ScanCloud, colour: str) -> tuple[np.ndarray, Html]:
     """Colour a cloud by one of COLOURS: ((h, w) grey levels or (h, w, 3) RGB, uint8; the legend)."""
     if colour == "error":
         if not cloud.errors:

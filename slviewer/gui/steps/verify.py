@@ -32,7 +32,7 @@ MUCH_MASKED = 0.2
 """Share of a scan that is reported as a warning."""
 
 
-class Panel(StepPanel):
+class VerifyPanel(StepPanel):
     """Panel of the step Verify."""
 
     key = "verify"
