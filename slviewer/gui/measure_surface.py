@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from slviewer.gui.inputs import Choice, change, display_name
+from slviewer.gui.inputs import Choice, change, scan_options
 from slviewer.gui.measure_html import deviation_bar
 from slviewer.gui.panel import PanelContext
 from slviewer.gui.pictures import Painter
@@ -55,7 +55,7 @@ class SurfaceView:
     def offer(self, session: SessionView | None) -> None:
         """Offer the surfaces that can be measured on, and draw the chosen one."""
         scans = [scan for scan in sort_scans(session.scans) if scan.cloud == "fresh"] if session else []
-        offered = [(scan.name, display_name(scan.name, scan.label)) for scan in scans]
+        offered = scan_options(scans)
         folder = session.folder if session else None
         cut = session.restriction if session else lambda _: (None, ())
         self._versions = {s.name: (folder, s.figures, *cut(s.name)) for s in scans}

@@ -103,12 +103,7 @@ def write_shape(
     path = Path(path)
     file_format = path.suffix.lower().removeprefix(".")
     points, faces = (shape.vertices, shape.faces) if isinstance(shape, Mesh) else (shape.points, None)
-    formats = point_formats() if faces is None else mesh_formats()
-    if file_format not in formats:
-        what = "a cloud" if faces is None else "a mesh"
-        why = ": it has no triangles" if file_format in mesh_formats() else ""
-        listed = ", ".join(f".{each}" for each in formats)
-        raise InputError(f"{path.name}: {what} cannot be written so{why}; choose one of {listed}")
+    _check_format(path, is_mesh=faces is not None)
     if not len(points) or (faces is not None and not len(faces)):
         raise InputError(f"{path.name} would be empty: there is nothing to write")
     if not np.isfinite(points).all():
@@ -130,6 +125,17 @@ def write_shape(
         encode = {"stl": _encode_stl, "obj": _encode_obj, "glb": _encode_glb, "3mf": _encode_3mf}[file_format]
         replace_file(path, encode(shape, notes))
     return path.stat().st_size
+
+
+def _check_format(path: Path, is_mesh: bool) -> None:
+    """Raise InputError unless points or meshes can be written in the format of the suffix."""
+    formats = mesh_formats() if is_mesh else point_formats()
+    file_format = path.suffix.lower().removeprefix(".")
+    if file_format not in formats:
+        what = "a mesh" if is_mesh else "a cloud"
+        why = ": it has no triangles" if file_format in mesh_formats() else ""
+        listed = ", ".join(f".{each}" for each in formats)
+        raise InputError(f"{path.name}: {what} cannot be written so{why}; choose one of {listed}")
 
 
 def write_textured(path: str | Path, shape: Mesh, uv: np.ndarray, image: np.ndarray, notes: Sequence[str] = ()) -> int:

@@ -187,6 +187,11 @@ class ScanView:
     edits: tuple[str, ...] = ()  # that are in effect, in words
     undone_edits: int = 0  # which can be redone
 
+    @property
+    def is_placed(self) -> bool:
+        """Whether the scan is in its place beside others."""
+        return self.placement is not None and self.placement.is_good
+
 
 @dataclass(frozen=True)
 class ExportView:

@@ -13,7 +13,7 @@ from slviewer.gui.calibration_html import (
     splined_html,
     verdict_html,
 )
-from slviewer.gui.inputs import Choice, SessionValue, change, display_name
+from slviewer.gui.inputs import Choice, SessionValue, change, scan_options
 from slviewer.gui.panel import PanelContext, StepPanel
 from slviewer.gui.pictures import PLOT_PX, Plot
 from slviewer.gui.widgets import Html, Text, coloured, paint, paragraph, report_table, table, to_html
@@ -119,9 +119,7 @@ class CalibratePanel(StepPanel):
             names = [pose.name for pose in session.poses if pose.state in ("used", "excluded", "unused")]
             self._pose.offer([(name, name) for name in names], worst(calibration))
             self._axis.offer([(axis, axis) for axis in calibration.fit_rms_mm])
-            clouds = [
-                (scan.name, display_name(scan.name, scan.label)) for scan in session.scans if scan.cloud != "absent"
-            ]
+            clouds = scan_options(scan for scan in session.scans if scan.cloud != "absent")
             self._over.offer([("", "none"), *clouds])
             self._fits.set(_fits(calibration))
             if not self._pixel_chosen:
@@ -180,7 +178,7 @@ class CalibratePanel(StepPanel):
     def _refresh(self) -> None:
         """Request the pictures of the chosen pose, axis and pixel."""
         with self._lock:
-            session = self._snapshot.session if self._snapshot else None
+            session = self._session
             if session is None or session.calibration is None:
                 return
             calibration, context = session.calibration, self._context

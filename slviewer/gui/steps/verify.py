@@ -5,7 +5,7 @@ from typing import Any
 
 import viser
 
-from slviewer.gui.inputs import Choice, change, display_name
+from slviewer.gui.inputs import Choice, change, display_name, scan_options
 from slviewer.gui.panel import PanelContext, StepPanel
 from slviewer.gui.pictures import PLOT_PX, Plot
 from slviewer.gui.preview import draw_preview, exposure_html, legend
@@ -128,7 +128,7 @@ class VerifyPanel(StepPanel):
         names = {scan.name for scan in waiting}
         change(self._recorded_folder, visible=bool(session.scans))
         self._recorded.offer(
-            [(scan.name, display_name(scan.name, scan.label)) for scan in waiting]
+            scan_options(waiting)
             + [
                 (scan.name, f"{display_name(scan.name, scan.label)}, measured")
                 for scan in session.scans
@@ -142,7 +142,7 @@ class VerifyPanel(StepPanel):
     def _refresh(self) -> None:
         """Request the error maps and the cloud of the chosen result."""
         with self._lock:
-            session = self._snapshot.session if self._snapshot else None
+            session = self._session
             name = self._result.value
             found = session.list_records(Verification) if session else []
             view = next((each for each in found if each.name == name), None)
@@ -186,7 +186,7 @@ class VerifyPanel(StepPanel):
 
     def _request_all(self, shape: Shape) -> None:
         """Request the verification of all captures of a shape that have none yet."""
-        session = self._snapshot.session if self._snapshot else None
+        session = self._session
         if session is not None:
             self._request_verification(
                 [scan.name for scan in _list_unverified(session) if shape_of(scan) == shape], shape
