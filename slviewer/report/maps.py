@@ -96,10 +96,10 @@ def draw_error_maps(
     add_colour_bar(drawing, image, axes, "error, mm", extend="both")
     _draw_histogram(histogram, cropped, rms_mm, floor_mm, limit)
     listed = ", ".join(f"{model} {rms_mm[model]:.3f} mm" for model in maps)
+    floor = f"; dotted: noise alone ({floor_mm:.3f} mm)" if np.isfinite(floor_mm) else ""
     return finish_figure(
         drawing,
-        f"{title}: errors on one colour scale, {sign}; grey: not measured. Dashed: plus and minus the RMS"
-        f"{_describe_floor(floor_mm)}.",
+        f"{title}: errors on one colour scale, {sign}; grey: not measured. Dashed: plus and minus the RMS{floor}.",
         f"Error maps and histograms of {title}; RMS {listed}",
     )
 
@@ -192,8 +192,3 @@ def _crop_slices(maps: list[np.ndarray]) -> tuple[slice, slice]:
 def _format_median(value: float) -> str:
     """Text of a median RMS in mm; "no pixel fitted" for NaN."""
     return f"median {value:.3f} mm" if np.isfinite(value) else "no pixel fitted"
-
-
-def _describe_floor(floor_mm: float) -> str:
-    """The caption's part that explains the noise floor, mm; empty for NaN."""
-    return f"; dotted: noise alone ({floor_mm:.3f} mm)" if np.isfinite(floor_mm) else ""

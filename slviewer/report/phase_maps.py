@@ -44,15 +44,15 @@ def reason_shares(phase: PhaseMap) -> dict[Reason, float]:
     return {reason: float(counts[reason] / max(1, phase.reason.size)) for reason in Reason}
 
 
-def phase_maps(title: str, phases: Mapping[Axis, PhaseMap], *, width: int = FULL) -> Figure:
+def phase_maps(title: str, phases: Mapping[Axis, PhaseMap]) -> Figure:
     """The coordinates of each axis side by side; masked pixels in the colour of their reason, with their shares."""
     from matplotlib.colors import to_rgb
     from matplotlib.patches import Patch
 
     h, w = next(iter(phases.values())).reason.shape
-    map_px = (width - 70 * len(phases)) // len(phases)
+    map_px = (FULL - 70 * len(phases)) // len(phases)
     height = round(map_px * h / w) + _AROUND_PX
-    drawing = new_figure(width, height)
+    drawing = new_figure(FULL, height)
     drawing.suptitle(title, x=0.004, ha="left", fontsize=SMALL_PT + 3, color=INK, fontweight="bold")
     step = max(1, -(-w // (DENSITY * map_px)))
     for axes, (axis, phase) in zip(np.atleast_1d(drawing.subplots(1, len(phases))), phases.items(), strict=True):

@@ -172,23 +172,21 @@ def write_textured(path: str | Path, shape: Mesh, uv: np.ndarray, image: np.ndar
     return sum(each.stat().st_size for each in (path, mtl, png))
 
 
-def estimated_bytes(
-    file_format: str, points: int, faces: int = 0, *, colours: bool = True, normals: bool = True, scalars: int = 0
-) -> int:
+def estimated_bytes(file_format: str, points: int, faces: int = 0, *, colours: bool = True, scalars: int = 0) -> int:
     """Estimate the size of a file of so many points and faces: within 1 % of binary files, some 20 % of texts."""
     if file_format == "ply":
-        return 300 + points * (12 + 12 * normals + 3 * colours + 4 * scalars) + faces * FACE.itemsize
+        return 300 + points * (24 + 3 * colours + 4 * scalars) + faces * FACE.itemsize
     if file_format == "stl":
         return 84 + faces * FACET_BYTES
     if file_format == "glb":
-        return 1200 + points * (12 + 12 * normals + 4 * colours) + 12 * faces
+        return 1200 + points * (24 + 4 * colours) + 12 * faces
     if file_format == "e57":
         return 4000 + points * (12 + 3 * colours)
     if file_format == "3mf":
         return 1500 + 14 * points + 7 * faces
     if file_format == "obj":
-        vertex = 3 * _NUMBER + 2 + normals * (3 * _SMALL + 4) + 21 * colours
-        return 200 + points * vertex + faces * (3 + 3 * (1 + normals) * len(str(points)) + 6 * normals)
+        vertex = 3 * _NUMBER + 3 * _SMALL + 6 + 21 * colours
+        return 200 + points * vertex + faces * (9 + 6 * len(str(points)))
     return points * (3 * _NUMBER + 3 * _GREY * colours)
 
 

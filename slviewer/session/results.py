@@ -128,11 +128,6 @@ def read_arrays(folder: Path, only: Collection[str] | None = None) -> dict[str, 
     return arrays
 
 
-def _hash_file(path: Path) -> bytes:
-    """Return the digest of a file of an array."""
-    return hashlib.blake2b(read_file(path, MAX_ARRAY_BYTES), digest_size=20).digest()
-
-
 def _read_array(path: Path) -> np.ndarray:
     """Read a .npy file. Raises ValueError unless it holds exactly the numbers or texts that its header announces."""
     with open_regular(path) as file:

@@ -108,6 +108,16 @@ class RigView:
     notes: tuple[str, ...] = ()  # settings that its camera refused
     turntable: str = ""  # its name; empty: the rig has none
 
+    @property
+    def is_idle(self) -> bool:
+        """Whether it is open, and nothing is captured."""
+        return self.state == "open" and self.capture is None
+
+    @property
+    def is_recorded(self) -> bool:
+        """Whether its captures are those of a recording."""
+        return self.choice is not None and self.choice.get("driver") == "replay"
+
 
 @dataclass(frozen=True, eq=False)
 class PoseView:

@@ -45,7 +45,6 @@ class CalibratePanel(StepPanel):
         super().__init__(context)
         self._pixel_chosen = False
         self._boards: tuple[Any, ...] = ()
-        self._cloud: result_views.ScanCloud | None = None
         self._details: tuple[tuple[Any, ...], CalibrationFigures] | None = None
         self._chosen = ""  # the operator's model in the latest snapshot
 
@@ -104,15 +103,11 @@ class CalibratePanel(StepPanel):
             session, calibration, busy = snapshot.session, snapshot.calibration, snapshot.is_busy
             label = "Calibrate again" if calibration else "Calibrate"
             change(self._calibrate, disabled=busy or snapshot.step(self.key).state == "blocked", label=label)
-            shown = calibration is not None
             self._draw_verdict(session, calibration)
             self._draw_models(calibration, busy)
-            for folder, visible in (
-                (self._poses_folder, shown and bool(calibration and calibration.stereo.poses)),
-                (self._parameters_folder, shown),
-                (self._pixels_folder, shown and bool(calibration and calibration.fit_rms_mm)),
-            ):
-                change(folder, visible=visible)
+            change(self._poses_folder, visible=bool(calibration and calibration.stereo.poses))
+            change(self._parameters_folder, visible=calibration is not None)
+            change(self._pixels_folder, visible=bool(calibration and calibration.fit_rms_mm))
             self._summary.set(_summary(calibration) if calibration else "")
             if session is None or calibration is None:
                 return
@@ -348,8 +343,7 @@ class CalibratePanel(StepPanel):
         self._cloud = cloud
         self._scene.cloud(LAYER, "cloud", cloud.points, paint(cloud.points[..., 2], "mm", 1, "")[0])
         self._scene.show(LAYER, self._visible)
-        if self._visible:
-            self._context.viewpoints.show(f"{LAYER} {cloud.name}", cloud.points)
+        self._show_view()
 
     def _pick_pixel(self, origin: np.ndarray, direction: np.ndarray) -> None:
         """Choose the pixel whose point is closest to the clicked ray."""

@@ -61,7 +61,6 @@ class ScanPanel(StepPanel):
         super().__init__(context)
         self._known: tuple[str, ...] = ()
         self._placed: tuple[str, ...] | None = None
-        self._cloud: ScanCloud | None = None
         self._loaded: tuple[Any, ScanCloud] | None = None
         self._whole: ScanCloud | None = None
         self._redraws = 0
@@ -179,12 +178,11 @@ class ScanPanel(StepPanel):
     def _draw_capture(self, snapshot: Snapshot) -> None:
         """Update the inputs of capture, live scan and import."""
         rig = snapshot.rig
-        is_free = rig.state == "open" and rig.capture is None
-        ready = is_free and snapshot.step(self.key).state != "blocked"
+        ready = rig.is_idle and snapshot.step(self.key).state != "blocked"
         change(self._capture_folder, visible=rig.state != "none")
         change(self._capture, disabled=not ready)
         self._draw_live(snapshot.live, ready)
-        change(self._patterns, disabled=not is_free)
+        change(self._patterns, disabled=not rig.is_idle)
         if snapshot.session is not None:
             self._patterns_value.update(snapshot.session.patterns)
         self._exposures.draw(snapshot)
@@ -349,11 +347,6 @@ class ScanPanel(StepPanel):
             self._scene.remove(LAYER, "picked")
             self._point.set("")
         self._show_view()
-
-    def _show_view(self) -> None:
-        """Move the browsers' views to the cloud, if it is visible."""
-        if self._visible and self._cloud is not None:
-            self._context.viewpoints.show(f"{LAYER} {self._cloud.name}", self._cloud.points)
 
     def _show_point(self, origin: np.ndarray, direction: np.ndarray) -> None:
         """Show the values of the point closest to the clicked ray."""

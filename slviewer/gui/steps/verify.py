@@ -41,7 +41,6 @@ class VerifyPanel(StepPanel):
     def __init__(self, context: PanelContext) -> None:
         super().__init__(context)
         self._measured: tuple[str, ...] = ()
-        self._cloud: result_views.ScanCloud | None = None
 
     def build(self) -> None:
         """Create the inputs of capture, results and recorded captures."""
@@ -90,7 +89,7 @@ class VerifyPanel(StepPanel):
             rig = snapshot.rig
             change(self._capture_folder, visible=rig.state != "none")
             for button in (self._plane, self._sphere):
-                change(button, disabled=not ready or rig.state != "open" or rig.capture is not None)
+                change(button, disabled=not (ready and rig.is_idle))
             self._simulated.draw(snapshot)
             if session is None or not ready:
                 for folder in (self._recorded_folder, self._result_folder, self._table_folder):
@@ -170,11 +169,6 @@ class VerifyPanel(StepPanel):
         title = f"error of {model}; {SIGN[shape]}; grey: not evaluated"
         self._legend.set(colour_bar(f"−{limit:g} mm", f"+{limit:g} mm", "error", title))
         self._show_view()
-
-    def _show_view(self) -> None:
-        """Move the browsers' views to the cloud, if it is visible."""
-        if self._visible and self._cloud is not None:
-            self._context.viewpoints.show(f"{LAYER} {self._cloud.name}", self._cloud.points)
 
     # requests
 
