@@ -38,7 +38,7 @@ from slviewer.session.capture import Capture
 from slviewer.session.inspection_plan import Characteristic, list_plans
 from slviewer.session.measurements import FOLDER as MEASUREMENTS
 from slviewer.session.measurements import NAMES, Measurement, measurement_from_meta
-from slviewer.session.names import natural_key
+from slviewer.session.names import join_names, natural_key
 from slviewer.session.scan_edits import list_edits, load_region, restriction_inputs
 from slviewer.session.store import Session
 from slviewer.target.board import Board
@@ -374,9 +374,8 @@ class SessionReader:
         dropped = [n for n in inputs if n in excluded]
         for names, change in ((gone, "retaken or deleted"), (dropped, "excluded")):
             if names:
-                more = f" and {len(names) - 3} more" if len(names) > 3 else ""
                 verb = "was" if len(names) == 1 else "were"
-                return f"{', '.join(names[:3])}{more} {verb} {change} since: calibrate again"
+                return f"{join_names(names, 3)} {verb} {change} since: calibrate again"
         return ""
 
     # verifications, scans, merges, measurements
