@@ -72,7 +72,7 @@ if TYPE_CHECKING:
     from slviewer.reconstruction.reconstruct import reconstruct_cloud
     from slviewer.records.verification import Verification
     from slviewer.registration.multiway import register_all as align_clouds
-    from slviewer.report.maps import error_maps as draw_error_maps
+    from slviewer.report.maps import draw_error_maps
     from slviewer.session.measurements import Measurement
     from slviewer.session.ply import read_ply, write_ply
     from slviewer.simulation.boards import Pose
@@ -119,7 +119,7 @@ _EXPORTS = {
     "datasets": "pipeline.datasets:*",
     "decode": "fringe.decode",
     "detect_board": "target.detect:detect",
-    "draw_error_maps": "report.maps:error_maps",
+    "draw_error_maps": "report.maps",
     "evaluate_plane": "evaluation.plane",
     "evaluate_sphere": "evaluation.sphere",
     "export": "pipeline.export",

@@ -32,7 +32,7 @@ from slviewer.server.secure import SafeServer, Serving, serve
 from slviewer.server.viewers import Viewers
 from slviewer.server.viser_internals import ViserClient
 from slviewer.session.store import Session
-from slviewer.wizard.notices import describe_error
+from slviewer.wizard.notices import describe_failure
 from slviewer.wizard.operator import Operator
 from slviewer.wizard.preparation import Preparation
 from slviewer.wizard.snapshot import Level
@@ -168,7 +168,7 @@ class App:
 
     def _report_failure(self, error: BaseException) -> None:
         """Show an error as a notification in every browser."""
-        self._notify("error", describe_error("This", error))
+        self._notify("error", describe_failure("This", error))
 
     def _show_step(self, key: str) -> None:
         """Show another step, drawn at once."""

@@ -52,9 +52,8 @@ class ExposureInputs:
     def draw(self, snapshot: Snapshot) -> None:
         """Show the exposures of the session, and what the last suggestion measures."""
         session, rig = snapshot.session, snapshot.rig
-        recorded = rig.choice is not None and rig.choice.get("driver") == "replay"
-        idle = rig.state == "open" and rig.capture is None and session is not None
-        shown = rig.exposure_ms is not None and not recorded
+        idle = rig.is_idle and session is not None
+        shown = rig.exposure_ms is not None and not rig.is_recorded
         change(self._suggest, visible=shown, disabled=not idle)
         latest = snapshot.exposure_change
         change(self._undo, visible=shown and latest is not None, disabled=not idle)

@@ -3,29 +3,10 @@
 A finding's section is named after its key: the cause of a diagnosis, the name of a check, the reason of a refusal.
 """
 
-from typing import get_args
-
-from slviewer.calibration.diagnosis.verdict import CAUSES
-from slviewer.fringe.phase import Reason as PixelReason
-from slviewer.fringe.suspect import Fault
 from slviewer.gui.widgets import Html, to_html
-from slviewer.pipeline.check_results import CHECK_NAMES
-from slviewer.registration.refusal import Reason as Refusal
 from slviewer.server.help_pages import PREFIX
 
 STEPS_PAGE, FINDINGS_PAGE = "howto/wizard.md", "explanation/findings.md"
-FINDINGS: tuple[str, ...] = tuple(
-    dict.fromkeys(
-        [
-            *(f"frame-{fault}" for fault in get_args(Fault)),
-            *(f"pixel-{reason.name.lower()}" for reason in PixelReason if reason != PixelReason.VALID),
-            *(f"check-{name}" for name in CHECK_NAMES),
-            *CAUSES,
-            *(f"merge-{reason}" for reason in get_args(Refusal)),
-        ]
-    )
-)
-"""Anchors of the findings, one section each."""
 STAGES = {
     "rig": "check-of-the-rig",
     "target": "target-poses",

@@ -3,12 +3,13 @@
 import math
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import viser
 
 from slviewer.gui.panel import PanelContext
+from slviewer.wizard.snapshot import ScanView
 
 NOTHING = "–"
 TYPING_S = 1.0
@@ -63,6 +64,11 @@ class SessionValue:
 def display_name(name: str, label: str) -> str:
     """Return the text for a capture in a list: its label, followed by its name if they differ."""
     return name if label == name else f"{label} ({name})"
+
+
+def scan_options(scans: Iterable[ScanView]) -> list[tuple[str, str]]:
+    """Return (name, text) of each scan, for a `Choice`."""
+    return [(scan.name, display_name(scan.name, scan.label)) for scan in scans]
 
 
 class Choice:

@@ -50,19 +50,9 @@ def drawn(
         a, b = (np.array(end) for end in measured.data["ends"])
         return _draw_dimension(a, b)
     if measured.kind == "section":
-        plane = from_plain(measured.data["plane"], CutPlane)
-        off = _OFF * float(np.ptp(np.concatenate(lines)[:, 0])) if lines else 0.0
-        cut = [lifted(plane, line + np.array([0.0, off])) for line in lines]
-        place = cut[0][np.argmax(cut[0] @ plane.up)] if cut else plane.origin
-        return np.concatenate([_join_segments(each) for each in cut]) if cut else np.empty((0, 2, 3)), place
+        return _draw_section(from_plain(measured.data["plane"], CutPlane), lines)
     if measured.kind == "relation":
-        related = (feature_of(others[each]) for each in measured.of if each in others)
-        ends = [feature for feature in related if feature is not None]
-        if len(ends) != 2:
-            return None
-        # outside of both; a point is on the surface already
-        clear = 0.0 if any(end.kind == "point" for end in ends) else 1.2 * max(end.radius or 0.0 for end in ends)
-        return _draw_dimension(ends[0].place, ends[1].place, clear)
+        return _draw_relation([feature_of(others[each]) for each in measured.of if each in others])
     feature = feature_of(measured)
     return None if feature is None else (_draw_outline(feature, _get_extent(measured)), feature.place)
 
@@ -76,6 +66,25 @@ def feature_of(measured: Measurement) -> Feature | None:
 def lifted(plane: CutPlane, points: np.ndarray) -> np.ndarray:
     """Convert points (n, 2) mm of a section's drawing to points (n, 3) in space."""
     return np.asarray(plane.origin + points[..., :1] * plane.along + points[..., 1:] * plane.up)
+
+
+def _draw_section(plane: CutPlane, lines: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Draw the lines (k, 2) mm of a section, and return them as `drawn` does."""
+    if not lines:
+        return np.empty((0, 2, 3)), plane.origin
+    off = _OFF * float(np.ptp(np.concatenate(lines)[:, 0]))
+    cut = [lifted(plane, line + np.array([0.0, off])) for line in lines]
+    return np.concatenate([_join_segments(each) for each in cut]), cut[0][np.argmax(cut[0] @ plane.up)]
+
+
+def _draw_relation(features: Sequence[Feature | None]) -> tuple[np.ndarray, np.ndarray] | None:
+    """Draw the dimension line between two features; None unless there are two."""
+    ends = [feature for feature in features if feature is not None]
+    if len(ends) != 2:
+        return None
+    # outside of both; a point is on the surface already
+    clear = 0.0 if any(end.kind == "point" for end in ends) else 1.2 * max(end.radius or 0.0 for end in ends)
+    return _draw_dimension(ends[0].place, ends[1].place, clear)
 
 
 def _draw_outline(feature: Feature, extent: float) -> np.ndarray:

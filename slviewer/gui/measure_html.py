@@ -50,7 +50,7 @@ def measurement_html(measured: Measurement, labels: Mapping[str, str]) -> Html:
     return html
 
 
-def verdict_html(data: Mapping[str, Any]) -> Html:
+def deviation_html(data: Mapping[str, Any]) -> Html:
     """Return a deviation's verdict, and the number of points evaluated."""
     verdict, numbers = data["verdict"], data["statistics_mm"]
     html = Html("")

@@ -9,7 +9,7 @@ import viser
 
 from slviewer.gui.inputs import Choice, change
 from slviewer.gui.measure_drawing import drawn, label, lifted
-from slviewer.gui.measure_html import deviation_figure, measurement_html, measurements_table, verdict_html
+from slviewer.gui.measure_html import deviation_figure, deviation_html, measurement_html, measurements_table
 from slviewer.gui.measure_section import CURSORS, SectionPlot, cursor_points
 from slviewer.gui.panel import PanelContext
 from slviewer.gui.pictures import PLOT_PX, Painter, Plot
@@ -74,35 +74,31 @@ class MeasurementList:
     def draw(self, session: SessionView | None, on: str) -> list[Measurement]:
         """Show the session's measurements, in 3D those on the surface ``on``; returns the new ones."""
         with self._lock:
-            return self._draw_unlocked(session, on)
+            before, self._session, self._on = self._session, session, on
+            measured = self._measurements
+            if session is None or before is None or session.folder != before.folder:
+                self._known = {each.id for each in measured}
+                self._clear_drawings()
+            new = [each for each in measured if each.id not in self._known]
+            self._known = {each.id for each in measured}
+            self._offer_choice()
+            if new:
+                self._choice.choose(new[-1].id)
+            for folder in (self._chosen_folder, self._table_folder):
+                change(folder, visible=bool(measured))
+            change(self._restore, visible=bool(session and session.deleted_measurements))
+            files = [each for each in session.exports if each.name in (TABLE, PLAN)] if session else []
+            links = [link(self._context.offer(each.path), f"Download {each.name}") for each in files]
+            self._file.set("".join(map(paragraph, links)))
+            self.refresh()
+            return new
 
-    def _draw_unlocked(self, session: SessionView | None, on: str) -> list[Measurement]:
-        """Update list, choice and buttons from the session, without locking; returns the new measurements."""
-        if session is None or self._session is None or session.folder != self._session.folder:
-            self._known = {each.id for each in session.measurements} if session else set()
-            self._clear_drawings()
-        self._session, self._on = session, on
+    def _offer_choice(self) -> None:
+        """Offer the measurements, the latest first, by their names; by their ids too where names occur twice."""
         measured = self._measurements
         names = [each.name for each in measured]
-        self._choice.offer(
-            [
-                (each.id, each.name if names.count(each.name) == 1 else f"{each.name} ({each.id})")
-                for each in reversed(measured)
-            ]
-        )
-        new = [each for each in measured if each.id not in self._known]
-        self._known = {each.id for each in measured}
-        if new:
-            self._choice.choose(new[-1].id)
-        for folder in (self._chosen_folder, self._table_folder):
-            change(folder, visible=bool(measured))
-        change(self._restore, visible=bool(session and session.deleted_measurements))
-        files = [each for each in session.exports if each.name in (TABLE, PLAN)] if session else []
-        self._file.set(
-            "".join(paragraph(link(self._context.offer(each.path), f"Download {each.name}")) for each in files)
-        )
-        self.refresh()
-        return new
+        texts = [each.name if names.count(each.name) == 1 else f"{each.name} ({each.id})" for each in measured]
+        self._choice.offer([(each.id, text) for each, text in zip(measured, texts, strict=True)][::-1])
 
     def change_surface(self, on: str) -> None:
         """Draw the measurements of another surface."""
@@ -112,20 +108,17 @@ class MeasurementList:
     def refresh(self) -> None:
         """Update tables, plots and 3D drawings for the chosen measurement."""
         with self._lock:
-            self._refresh_unlocked()
-
-    def _refresh_unlocked(self) -> None:
-        """Update tables, plots and 3D drawings for the chosen measurement, without locking."""
-        chosen, measured = self.chosen, self._measurements
-        if (chosen.id if chosen else "") != self._chosen_id:
-            self._chosen_id = chosen.id if chosen else ""
-            self._changed(chosen)
-        labels = self._labels
-        self._table.set(measurements_table(measured, chosen.id if chosen else "", labels) if measured else "")
-        self._details.set(measurement_html(chosen, labels) if chosen else "")
-        self._draw_deviation(chosen if chosen and chosen.kind == "deviation" else None)
-        self._draw_section(chosen if chosen and chosen.kind == "section" else None)
-        self._request_drawings(chosen)
+            chosen, measured = self.chosen, self._measurements
+            chosen_id = chosen.id if chosen else ""
+            if chosen_id != self._chosen_id:
+                self._chosen_id = chosen_id
+                self._changed(chosen)
+            labels = self._labels
+            self._table.set(measurements_table(measured, chosen_id, labels) if measured else "")
+            self._details.set(measurement_html(chosen, labels) if chosen else "")
+            self._draw_deviation(chosen if chosen and chosen.kind == "deviation" else None)
+            self._draw_section(chosen if chosen and chosen.kind == "section" else None)
+            self._request_drawings(chosen)
 
     # inside
 
@@ -164,7 +157,7 @@ class MeasurementList:
             self._histogram.hide()
             self._verdict.set("")
             return
-        self._verdict.set(verdict_html(measured.data))
+        self._verdict.set(deviation_html(measured.data))
         verdict = measured.data["verdict"]
         tolerance = None if verdict is None else float(verdict["tolerance_mm"])
 
@@ -235,7 +228,7 @@ class MeasurementList:
                         self._drawn[each.id] = looks[each.id]
                         self._draw_one(each, others, each is chosen)
                 if chosen is not None and chosen.id in loaded:
-                    self._refresh_unlocked()
+                    self.refresh()
 
         self._painter.request("drawings", (self._on, tuple(looks.items()), tuple(cut)), make, show)
 

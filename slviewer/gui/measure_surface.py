@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from slviewer.gui.inputs import Choice, change, display_name
+from slviewer.gui.inputs import Choice, change, scan_options
 from slviewer.gui.measure_html import deviation_bar
 from slviewer.gui.panel import PanelContext
 from slviewer.gui.pictures import Painter
@@ -55,7 +55,7 @@ class SurfaceView:
     def offer(self, session: SessionView | None) -> None:
         """Offer the surfaces that can be measured on, and draw the chosen one."""
         scans = [scan for scan in sort_scans(session.scans) if scan.cloud == "fresh"] if session else []
-        offered = [(scan.name, display_name(scan.name, scan.label)) for scan in scans]
+        offered = scan_options(scans)
         folder = session.folder if session else None
         cut = session.restriction if session else lambda _: (None, ())
         self._versions = {s.name: (folder, s.figures, *cut(s.name)) for s in scans}
@@ -117,7 +117,7 @@ class SurfaceView:
             """Load the surface; returns (surface, points, colours, legend)."""
             on = context.operator.surface(name)
             if shown is None:
-                return (on, *painting(on, COLOURS[0] if colour == DEVIATION else colour))
+                return (on, *paint_surface(on, COLOURS[0] if colour == DEVIATION else colour))
             arrays = measurement_arrays(context.session, shown.id)
             return (on, *_colour_by_deviation(arrays, shown))
 
@@ -141,7 +141,7 @@ class SurfaceView:
             self._context.viewpoints.show(f"{self._layer} {self.on.source}", self.on.points)
 
 
-def painting(on: MeasuredSurface, colour: str) -> tuple[np.ndarray, np.ndarray, Html]:
+def paint_surface(on: MeasuredSurface, colour: str) -> tuple[np.ndarray, np.ndarray, Html]:
     """Colour a surface by one of COLOURS: (points (..., 3), their colours (..., 3), the legend)."""
     if colour == "texture" and on.texture is not None:
         return on.points, on.texture, Html("")

@@ -29,16 +29,11 @@ def merge_failure_html(
 
 def turntable_html(names: Sequence[str], table_deg: Sequence[float], labels: Mapping[str, str]) -> Html:
     """List the turntable angle of each scan."""
-    turned = [f"{_get_label(name, labels)} at {deg:g}°" for name, deg in zip(names, table_deg, strict=True)]
+    turned = [f"{labels.get(name, name)} at {deg:g}°" for name, deg in zip(names, table_deg, strict=True)]
     if len(turned) > 4:
         turned = [*turned[:3], "…", turned[-1]]
     note = "Direction and axis of the turntable are estimated."
     return paragraph(coloured(f"{', '.join(turned)}. {note}", "dim"))
-
-
-def _get_label(name: str, labels: Mapping[str, str]) -> str:
-    """Return the operator's label of a capture, or its name."""
-    return labels.get(name, name)
 
 
 def _letter_html(merge: Merge) -> Html:

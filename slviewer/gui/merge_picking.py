@@ -20,7 +20,7 @@ from slviewer.gui.widgets import Html, Text, alert, coloured, paragraph, table, 
 from slviewer.registration.multiway import Pair
 from slviewer.registration.picked import LEAST_PICKS, fit_picked_start
 from slviewer.session.store import Session
-from slviewer.wizard.result_views import ScanCloud, nearest, scan_cloud
+from slviewer.wizard.result_views import ScanCloud, load_scan_cloud, nearest
 
 LAYER = "merge picks"
 Side = Literal["scan", "onto"]
@@ -309,7 +309,9 @@ def _residuals_html(picks: _Picks) -> Html:
 
 def _load_side_by_side(session: Session, pair: Pair) -> _SideBySide:
     """Load two scans, the first moved to the left of the reference, at the same distance from the viewpoint."""
-    clouds: dict[Side, ScanCloud] = {side: scan_cloud(session, name) for side, name in zip(_SIDES, pair, strict=True)}
+    clouds: dict[Side, ScanCloud] = {
+        side: load_scan_cloud(session, name) for side, name in zip(_SIDES, pair, strict=True)
+    }
     flat = {side: cloud.points[np.isfinite(cloud.points[..., 2])].astype(np.float64) for side, cloud in clouds.items()}
     wide = max(float(np.ptp(np.percentile(points @ TO_THE_RIGHT, [1, 99]))) for points in flat.values())
     shift = np.median(flat["onto"], axis=0) - np.median(flat["scan"], axis=0) - (1 + _APART) * wide * TO_THE_RIGHT

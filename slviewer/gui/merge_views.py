@@ -47,7 +47,7 @@ def colour_scans(
     session: Session, names: Sequence[str], places: Mapping[str, np.ndarray], titles: Mapping[str, str]
 ) -> ColouredClouds:
     """Load scans, each in a colour, at their ``places`` (4, 4), or as captured where they have none."""
-    scans = tuple((result_views.scan_cloud(session, name), places.get(name, np.eye(4))) for name in names)
+    scans = tuple((result_views.load_scan_cloud(session, name), places.get(name, np.eye(4))) for name in names)
     clouds: dict[str, tuple[np.ndarray, np.ndarray | Colour]] = {}
     for i, (cloud, T) in enumerate(scans):
         points = (cloud.points @ T[:3, :3].T + T[:3, 3]).astype(np.float32)

@@ -20,7 +20,8 @@ from slviewer.gui.viewpoints import Viewpoints, look_at_points
 from slviewer.server.viewers import Viewers
 from slviewer.session.store import Session
 from slviewer.wizard.operator import Operator
-from slviewer.wizard.snapshot import Level, PreviewView, Snapshot
+from slviewer.wizard.result_views import ScanCloud
+from slviewer.wizard.snapshot import Level, PreviewView, SessionView, Snapshot
 
 ButtonColour = Literal["gray", "red", "orange", "green", "teal", "cyan"]
 
@@ -127,6 +128,17 @@ class StepPanel:
         self._lock = threading.RLock()
         self._snapshot: Snapshot | None = None
         self._visible = False
+        self._cloud: ScanCloud | None = None
+
+    @property
+    def _session(self) -> SessionView | None:
+        """The session of the latest snapshot; None where none is open."""
+        return self._snapshot.session if self._snapshot else None
+
+    def _show_view(self) -> None:
+        """Move the browsers' views to the panel's cloud, if it is visible."""
+        if self._visible and self._cloud is not None:
+            self._context.viewpoints.show(f"{self.layers[0]} {self._cloud.name}", self._cloud.points)
 
     def build(self) -> None:
         """Create the handles; called once, inside the panel's own container."""

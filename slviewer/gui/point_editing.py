@@ -131,11 +131,6 @@ class PointEditing:
         """The scans that are shown."""
         return [scan.cloud.name for scan in self._scans]
 
-    @property
-    def is_selecting(self) -> bool:
-        """Whether clicks and drags select points."""
-        return bool(self._mode.value != OFF)
-
     def set_scans(self, scans: Sequence[tuple[ScanCloud, np.ndarray | None]]) -> list[np.ndarray]:
         """Set the scans that are shown, with NaN for what edits and region removed, at T (4, 4) each (None: in its own
         frame); returns the points (h, w, 3) mm to show of each, without hidden ones.

@@ -34,8 +34,7 @@ class RigCheck:
     def draw(self, snapshot: Snapshot) -> None:
         """Show the result of the last check."""
         session, result, rig = snapshot.session, snapshot.preflight, snapshot.rig
-        recorded = rig.choice is not None and rig.choice.get("driver") == "replay"  # a recording cannot be checked
-        change(self._check, disabled=rig.state != "open" or rig.capture is not None or recorded)
+        change(self._check, disabled=not rig.is_idle or rig.is_recorded)  # a recording cannot be checked
         change(self._linear, visible=bool((result and result.levels) or (session and session.is_linear)))
         self._linear_value.update(bool(session and session.is_linear))
         better = result.exposure_ms if result else None

@@ -142,7 +142,6 @@ class ViewerScene:
         on_end: Callable[[np.ndarray], None] | None = None,
         *,
         scale_mm: float = 90.0,
-        turns: bool = True,
     ) -> None:
         """Add a handle to move and turn an object; both callbacks get T (4, 4) in the camera's frame."""
         wxyz, position = _split_pose(T)
@@ -152,7 +151,6 @@ class ViewerScene:
             scale=scale_mm,
             wxyz=wxyz,
             position=position,
-            disable_rotations=not turns,
             translation_limits=limits,  # type: ignore[arg-type]
             depth_test=False,
         )
@@ -245,13 +243,13 @@ class ViewerScene:
         )
         self._store_nodes(layer, name, nodes)
 
-    def lines(self, layer: str, name: str, segments: np.ndarray, colour: Colour, width_px: float = 3.0) -> None:
+    def lines(self, layer: str, name: str, segments: np.ndarray, colour: Colour) -> None:
         """Draw segments (n, 2, 3) mm."""
         handle = self._api.add_line_segments(
             self._make_path(layer, name),
             np.asarray(segments, np.float32),
             colour,
-            thickness=width_px,
+            thickness=3.0,
             thickness_units="screen",
         )
         self._store_nodes(layer, name, [handle])

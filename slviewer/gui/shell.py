@@ -21,7 +21,7 @@ from slviewer.gui.scene import CAMERA, PROJECTOR, ViewerScene
 from slviewer.gui.widgets import Html, Text, Tone, alert, coloured, meter, paragraph, to_html
 from slviewer.session.atomic import format_bytes
 from slviewer.wizard.autopilot import Autopilot
-from slviewer.wizard.snapshot import CalibrationView, Level, Notice, PreviewView, Snapshot, StepView
+from slviewer.wizard.snapshot import CalibrationView, Level, Notice, PreviewView, SessionView, Snapshot, StepView
 
 STEPS_PX, STEP_PX = 236, 452
 """Widths of the two panels: at 1280 px of page, the scene is as wide as the step."""
@@ -78,7 +78,8 @@ class Shell:
         self._gui, self._context = context.gui, context
         self._devices = DeviceLayer(context.scene)
         self._panels: dict[str, StepPanel] = {
-            step.key: importlib.import_module(f"slviewer.gui.steps.{step.key}").Panel(context) for step in steps
+            key: getattr(importlib.import_module(f"slviewer.gui.steps.{key}"), f"{key.title()}Panel")(context)
+            for key in (step.key for step in steps)
         }
         self._shown_key = self._autopilot_key = ""
         self.current = next((s.key for s in steps if s.state != "done"), steps[0].key)
@@ -277,12 +278,15 @@ def autopilot_step(snapshot: Snapshot) -> str:
         return "target"
     if job == "Calibrating":
         return "calibrate"
-    if world.standing == "board":
-        return "poses" if session.calibration is None or session.calibration.stale else "calibrate"
-    if world.standing != "object":
+    if world.standing == "object":
+        return "merge" if job.startswith("Merg") else _object_step(session)
+    if world.standing != "board":
         return "verify"
-    if job.startswith("Merg"):
-        return "merge"
+    return "poses" if session.calibration is None or session.calibration.stale else "calibrate"
+
+
+def _object_step(session: SessionView) -> str:
+    """Return the key of the autopilot's step once an object is in place: scan, export or measure."""
     latest = next((scan.name for scan in reversed(session.scans) if scan.purpose == "scan"), "")
     if session.merge is None or latest not in session.merge.record.scans:
         return "scan"

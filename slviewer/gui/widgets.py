@@ -248,8 +248,9 @@ class Sound:
         self._handle.content = f'<audio autoplay data-n="{self._count}" src="data:audio/wav;base64,{data}"></audio>'
 
 
-def _encode_wav(tones_hz: Sequence[float], rate: int = 8000, seconds: float = 0.12) -> bytes:
-    """Return a WAV file, 8-bit mono, of tones in Hz that each last `seconds`."""
+def _encode_wav(tones_hz: Sequence[float]) -> bytes:
+    """Return a WAV file, 8-bit mono, of tones in Hz that each last 0.12 s."""
+    rate, seconds = 8000, 0.12
     t = np.arange(int(rate * seconds)) / rate
     envelope = np.minimum(1, np.minimum(t, seconds - t) / 0.01)  # without it, tones click
     samples = np.concatenate([envelope * np.sin(2 * np.pi * f * t) for f in tones_hz])

@@ -14,8 +14,8 @@ that the dataclass does not have, gives absent fields their defaults, and leaves
 
 Records nest: a field may be another dataclass, a tuple, a mapping or an optional of these. Name fields after their keys
 on disk, and no method is needed. Where a published record holds computed figures too, add them to the plain fields:
-`to_plain(self) | {"decision": self.decision}`. `session.atomic.write_json` and the commands' `--json` take dataclasses
-as they are. Properties are not written.
+`to_plain(self) | {"decision": self.decision}`. `session.atomic.write_synced_json` and the commands' `--json` take
+dataclasses as they are. Properties are not written.
 """
 
 import os

@@ -76,13 +76,13 @@ def style_image_axes(axes: Any, title: str = "", colour: str = INK) -> None:
         spine.set_visible(False)
 
 
-def legend(axes: Any, **options: Any) -> None:
+def add_legend(axes: Any, **options: Any) -> None:
     """Add a legend of the labelled artists to the axes, in the page's type."""
     if axes.get_legend_handles_labels()[0]:
         axes.legend(**{"fontsize": SMALL_PT, "labelcolor": INK, "frameon": False, **options})
 
 
-def colour_bar(drawing: Any, image: Any, axes: Any, label: str, **options: Any) -> None:
+def add_colour_bar(drawing: Any, image: Any, axes: Any, label: str, **options: Any) -> None:
     """Add a colour bar beside ``axes``, in the page's type."""
     bar = drawing.colorbar(image, ax=axes, **{"shrink": 0.9, "aspect": 24, "pad": 0.02, **options})
     bar.ax.tick_params(labelsize=SMALL_PT, colors=SOFT, length=3, width=0.7)

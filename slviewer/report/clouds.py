@@ -10,9 +10,9 @@ from slviewer.report.canvas import (
     HALF,
     INK,
     TEXT_PT,
-    colour_bar,
+    add_colour_bar,
+    add_legend,
     finish_figure,
-    legend,
     new_figure,
     style_image_axes,
 )
@@ -54,7 +54,7 @@ def draw_clouds(views: Sequence[CloudView]) -> Figure:
         style_image_axes(ax, view.name)
         ax.imshow(picture)
         ax.set_xlabel(_format_count(view), fontsize=TEXT_PT, color=INK, loc="left")
-        colour_bar(drawing, ScalarMappable(Normalize(near, far), palette), ax, "z, mm", shrink=0.7, aspect=20)
+        add_colour_bar(drawing, ScalarMappable(Normalize(near, far), palette), ax, "z, mm", shrink=0.7, aspect=20)
     for ax in axes[len(views) :]:
         ax.set_axis_off()
     return finish_figure(
@@ -81,7 +81,7 @@ def draw_merged_cloud(view: CloudView) -> Figure:
     right.imshow(render_points(points, normals, palette[source % len(SCANS)], size, rotation))
     for i, name in enumerate(view.names):
         right.plot([], [], "s", color=SCANS[i % len(SCANS)], markersize=8, label=name)
-    legend(right, loc="upper left", bbox_to_anchor=(0, 0), ncols=max(len(view.names), 1), handletextpad=0.2)
+    add_legend(right, loc="upper left", bbox_to_anchor=(0, 0), ncols=max(len(view.names), 1), handletextpad=0.2)
     return finish_figure(
         drawing,
         "The merged cloud in the reference scan's frame. Right: each square shows the points of one scan alone, so "

@@ -13,10 +13,10 @@ from slviewer.report.canvas import (
     INK,
     SOFT,
     TITLE_PT,
-    colour_bar,
+    add_colour_bar,
+    add_legend,
     draw_map,
     finish_figure,
-    legend,
     model_colour,
     new_figure,
     percentile,
@@ -53,7 +53,7 @@ def rms_maps(rms_mm: np.ndarray, axis: str = "", *, width: int = FULL) -> Figure
         top = round_up(percentile(rms, 99))
         style_image_axes(axes, f"{name}: {_format_median(median)}")
         image = draw_map(axes, rms, "viridis", 100, 0, top)
-        colour_bar(drawing, image, axes, "" if narrow and name != "z" else "RMS of the fit, mm", extend="max")
+        add_colour_bar(drawing, image, axes, "" if narrow and name != "z" else "RMS of the fit, mm", extend="max")
     named = f" along axis {axis}" if axis else ""
     return finish_figure(
         drawing,
@@ -64,7 +64,7 @@ def rms_maps(rms_mm: np.ndarray, axis: str = "", *, width: int = FULL) -> Figure
     )
 
 
-def error_maps(
+def draw_error_maps(
     title: str,
     maps: Mapping[str, np.ndarray],
     rms_mm: Mapping[str, float],
@@ -93,13 +93,13 @@ def error_maps(
             ax, f"{model}: {'RMS ' if map_width > WIDE_PX else ''}{rms_mm[model]:.3f} mm", model_colour(model)
         )
         image = draw_map(ax, errors, "RdBu_r", 101, -limit, limit)
-    colour_bar(drawing, image, axes, "error, mm", extend="both")
+    add_colour_bar(drawing, image, axes, "error, mm", extend="both")
     _draw_histogram(histogram, cropped, rms_mm, floor_mm, limit)
     listed = ", ".join(f"{model} {rms_mm[model]:.3f} mm" for model in maps)
+    floor = f"; dotted: noise alone ({floor_mm:.3f} mm)" if np.isfinite(floor_mm) else ""
     return finish_figure(
         drawing,
-        f"{title}: errors on one colour scale, {sign}; grey: not measured. Dashed: plus and minus the RMS"
-        f"{_describe_floor(floor_mm)}.",
+        f"{title}: errors on one colour scale, {sign}; grey: not measured. Dashed: plus and minus the RMS{floor}.",
         f"Error maps and histograms of {title}; RMS {listed}",
     )
 
@@ -114,7 +114,7 @@ def verification_maps(title: str, found: Verification, arrays: Mapping[str, np.n
     rms = {model: np.nan if fit.rms_mm is None else fit.rms_mm for model, fit in fits.items()}
     floor = next((fit.noise_floor_mm for fit in reversed(fits.values()) if fit.noise_floor_mm is not None), np.nan)
     maps = {model: arrays[f"error_{model}"] for model in fits}
-    return error_maps(title, maps, rms, floor, width=width, sign=SIGN[found.shape])
+    return draw_error_maps(title, maps, rms, floor, width=width, sign=SIGN[found.shape])
 
 
 def error_limit(maps: list[np.ndarray]) -> float:
@@ -173,7 +173,7 @@ def _draw_histogram(
     axes.set_xlim(-reach, reach)
     axes.set_ylim(bottom=0)
     axes.set_yticks([])
-    legend(axes, loc="lower left", bbox_to_anchor=(-0.02, 1.0), borderaxespad=0.3, ncols=4, columnspacing=1.1)
+    add_legend(axes, loc="lower left", bbox_to_anchor=(-0.02, 1.0), borderaxespad=0.3, ncols=4, columnspacing=1.1)
 
 
 def _crop_slices(maps: list[np.ndarray]) -> tuple[slice, slice]:
@@ -192,8 +192,3 @@ def _crop_slices(maps: list[np.ndarray]) -> tuple[slice, slice]:
 def _format_median(value: float) -> str:
     """Text of a median RMS in mm; "no pixel fitted" for NaN."""
     return f"median {value:.3f} mm" if np.isfinite(value) else "no pixel fitted"
-
-
-def _describe_floor(floor_mm: float) -> str:
-    """The caption's part that explains the noise floor, mm; empty for NaN."""
-    return f"; dotted: noise alone ({floor_mm:.3f} mm)" if np.isfinite(floor_mm) else ""

@@ -1,24 +1,22 @@
 """Measurements on scans, and deviations of scans from nominal models: tables, sections, coloured surfaces."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slviewer.inspection.colours import EXCLUDED_COLOUR, colour_limit, deviation_colours
-from slviewer.inspection.quantities import Quantity
 from slviewer.inspection.tolerance import DECIDED, RULE
-from slviewer.records.plain import from_plain
 from slviewer.records.table import Cell, Column, Mark, Table
 from slviewer.report.canvas import (
     DENSITY,
     FULL,
     SOFT,
     TEXT_PT,
-    colour_bar,
+    add_colour_bar,
+    add_legend,
     finish_figure,
-    legend,
     new_figure,
     round_up,
     style_axes,
@@ -50,21 +48,7 @@ def measurements_section(rows: Sequence[Measurement], sections: Sequence[tuple[s
     items += [
         PageNotice(f"{row.name}: {note}.") for row in rows for note in row.data.get("fit", {}).get("warnings", ())
     ]
-    quantities = {row.id: from_plain(row.data["quantities"], list[Quantity]) for row in rows}
-    body: list[list[str | Cell]] = []
-    for row in rows:
-        named: list[str | Cell] = [
-            Cell(f"{row.name} (stale)", "worse") if row.stale else row.name,
-            row.kind,
-            row.source,
-        ]
-        where = " and ".join(row.data["between"]) if "between" in row.data else row.data.get("where", "")
-        for q in quantities[row.id]:
-            digits = 1 if q.unit == "%" else 4
-            U = UNKNOWN if q.U is None else f"{q.U:.{digits}f}{'' if q.whole else ' *'}"
-            unit = "°" if q.unit == "deg" else q.unit
-            body.append([*named, q.name, format_number(q.value, digits), unit, U, where])
-            named, where = ["", "", ""], ""
+    body = [cells for row in rows for cells in _measurement_rows(row)]
     columns = [Column("measurement", align="left"), Column("kind", align="left"), Column("scan", align="left")]
     columns += [Column("quantity", align="left"), Column("value"), Column("unit", align="left")]
     columns += [Column("U, k = 2"), Column("of", align="left")]
@@ -72,12 +56,26 @@ def measurements_section(rows: Sequence[Measurement], sections: Sequence[tuple[s
         "U is the expanded uncertainty: the scatter of the points, and the calibration's uncertainty. –: a "
         "residual or a plain reading, which has none."
     ]
-    if any(q.U is not None and not q.whole for each in quantities.values() for q in each):
+    if any(q.U is not None and not q.whole for row in rows for q in row.quantities):
         notes.append("* without the calibration's part, which is unknown.")
     if body:
         items.append(Table(columns, body, "Measured on the scans", notes))
     items += [section_plot(name, lines) for name, lines in sections]
     return Section("Measurements", "Distances, fitted shapes and their relations.", items)
+
+
+def _measurement_rows(measured: Measurement) -> Iterator[list[str | Cell]]:
+    """Yield the cells of each quantity of a measurement; what they share stands in the first row."""
+    name = Cell(f"{measured.name} (stale)", "worse") if measured.stale else measured.name
+    named: list[str | Cell] = [name, measured.kind, measured.source]
+    data = measured.data
+    where = " and ".join(data["between"]) if "between" in data else data.get("where", "")
+    for q in measured.quantities:
+        digits = 1 if q.unit == "%" else 4
+        U = UNKNOWN if q.U is None else f"{q.U:.{digits}f}{'' if q.whole else ' *'}"
+        unit = "°" if q.unit == "deg" else q.unit
+        yield [*named, q.name, format_number(q.value, digits), unit, U, where]
+        named, where = ["", "", ""], ""
 
 
 def section_plot(
@@ -210,7 +208,7 @@ def draw_deviations(axes: Any, edges: np.ndarray, counts: np.ndarray, limit: flo
         for side in (-tolerance, tolerance):
             axes.axvline(side, color=TOLERANCE, linewidth=1.2, linestyle="--")
         axes.plot([], [], color=TOLERANCE, linewidth=1.2, linestyle="--", label=f"tolerance ± {tolerance:g} mm")
-        legend(axes, loc="lower right", bbox_to_anchor=(1, 1.0), borderaxespad=0.2)
+        add_legend(axes, loc="lower right", bbox_to_anchor=(1, 1.0), borderaxespad=0.2)
 
 
 def draw_deviation(view: Measurement, arrays: Mapping[str, np.ndarray]) -> Figure:
@@ -239,7 +237,7 @@ def draw_deviation(view: Measurement, arrays: Mapping[str, np.ndarray]) -> Figur
         render_points(points, normals, colours, (DENSITY * width, DENSITY * height), view_rotation(YAW_DEG, PITCH_DEG))
     )
     mapped = ScalarMappable(Normalize(-limit, limit), palette)
-    colour_bar(drawing, mapped, left, "deviation, mm", location="bottom", shrink=0.7, aspect=40, pad=0.02)
+    add_colour_bar(drawing, mapped, left, "deviation, mm", location="bottom", shrink=0.7, aspect=40, pad=0.02)
     numbers = view.data["statistics_mm"]
     style_axes(right, f"RMS {numbers['rms']:.4f} mm", "deviation, mm", "points, %")
     edges = arrays["edges"]

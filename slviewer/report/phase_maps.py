@@ -7,7 +7,16 @@ import numpy as np
 
 from slviewer.fringe.phase import PhaseMap, Reason
 from slviewer.fringe.sequence import Axis
-from slviewer.report.canvas import DENSITY, FULL, INK, SMALL_PT, colour_bar, finish_figure, new_figure, style_image_axes
+from slviewer.report.canvas import (
+    DENSITY,
+    FULL,
+    INK,
+    SMALL_PT,
+    add_colour_bar,
+    finish_figure,
+    new_figure,
+    style_image_axes,
+)
 from slviewer.report.page import Figure
 
 REASON_LABELS = {
@@ -35,15 +44,15 @@ def reason_shares(phase: PhaseMap) -> dict[Reason, float]:
     return {reason: float(counts[reason] / max(1, phase.reason.size)) for reason in Reason}
 
 
-def phase_maps(title: str, phases: Mapping[Axis, PhaseMap], *, width: int = FULL) -> Figure:
+def phase_maps(title: str, phases: Mapping[Axis, PhaseMap]) -> Figure:
     """The coordinates of each axis side by side; masked pixels in the colour of their reason, with their shares."""
     from matplotlib.colors import to_rgb
     from matplotlib.patches import Patch
 
     h, w = next(iter(phases.values())).reason.shape
-    map_px = (width - 70 * len(phases)) // len(phases)
+    map_px = (FULL - 70 * len(phases)) // len(phases)
     height = round(map_px * h / w) + _AROUND_PX
-    drawing = new_figure(width, height)
+    drawing = new_figure(FULL, height)
     drawing.suptitle(title, x=0.004, ha="left", fontsize=SMALL_PT + 3, color=INK, fontweight="bold")
     step = max(1, -(-w // (DENSITY * map_px)))
     for axes, (axis, phase) in zip(np.atleast_1d(drawing.subplots(1, len(phases))), phases.items(), strict=True):
@@ -55,7 +64,9 @@ def phase_maps(title: str, phases: Mapping[Axis, PhaseMap], *, width: int = FULL
         for code, colour in REASON_COLOURS.items():
             cover[reason == code] = (*to_rgb(colour), 1.0)
         axes.imshow(cover, aspect="equal", interpolation="nearest")
-        colour_bar(drawing, image, axes, f"projector {'column' if axis == 'x' else 'row'}, px", orientation="vertical")
+        add_colour_bar(
+            drawing, image, axes, f"projector {'column' if axis == 'x' else 'row'}, px", orientation="vertical"
+        )
         patches = [
             Patch(
                 facecolor=colour,

@@ -10,7 +10,7 @@ from slviewer.report.canvas import HALF
 from slviewer.report.clouds import draw_clouds, draw_merged_cloud
 from slviewer.report.curves import pixel_curves
 from slviewer.report.data import PlaneRow, ReproductionData
-from slviewer.report.maps import error_limit, error_maps, rms_maps
+from slviewer.report.maps import draw_error_maps, error_limit, rms_maps
 from slviewer.report.page import Headline, Item, PageNotice, Section
 from slviewer.report.space import planes_in_space
 from slviewer.report.tables import (
@@ -160,7 +160,7 @@ def _planes_section(data: ReproductionData) -> Section:
         )
     if data.planes:
         items += [rms_bars(data.planes), plane_table(data.planes, "Table 1: RMS distance from the best plane")]
-    items += [error_maps(m.title, m.maps, m.rms_mm, m.noise_floor_mm) for m in data.plane_maps]
+    items += [draw_error_maps(m.title, m.maps, m.rms_mm, m.noise_floor_mm) for m in data.plane_maps]
     if data.plane_outlines:
         items.append(planes_in_space(data.plane_outlines, data.depth_range_mm))
     return Section("Experiment 2a: planes", text, items)
@@ -176,7 +176,9 @@ def _spheres_section(data: ReproductionData) -> Section:
     if data.sphere_maps:
         limit = error_limit([errors for m in data.sphere_maps for errors in m.maps.values()])
         items += [
-            error_maps(m.title, m.maps, m.rms_mm, m.noise_floor_mm, limit_mm=limit, width=HALF, sign="red is outwards")
+            draw_error_maps(
+                m.title, m.maps, m.rms_mm, m.noise_floor_mm, limit_mm=limit, width=HALF, sign="red is outwards"
+            )
             for m in data.sphere_maps
         ]
     return Section(

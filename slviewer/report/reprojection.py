@@ -11,9 +11,9 @@ from slviewer.report.canvas import (
     HALF,
     INK,
     SMALL_PT,
-    colour_bar,
+    add_colour_bar,
+    add_legend,
     finish_figure,
-    legend,
     new_figure,
     round_up,
     style_axes,
@@ -46,7 +46,7 @@ def pose_bars(
     crowded = len(names) * max(map(len, names)) > width / 9
     axes.set_xticks(at, names, rotation=90 if crowded else 0, fontsize=SMALL_PT)
     axes.set_xlim(-0.7, len(names) - 0.3)
-    legend(axes, loc="lower left", bbox_to_anchor=(0, 1.0), ncols=2, borderaxespad=0.2, columnspacing=1.2)
+    add_legend(axes, loc="lower left", bbox_to_anchor=(0, 1.0), ncols=2, borderaxespad=0.2, columnspacing=1.2)
     worst = names[int(np.argmax(np.nan_to_num(values).max(axis=1)))]
     return finish_figure(
         drawing,
@@ -121,7 +121,7 @@ def coverage(title: str, size: tuple[int, int], poses: Sequence[np.ndarray]) -> 
         interpolation="nearest",
         zorder=0,
     )
-    colour_bar(drawing, image, axes, "poses", shrink=0.7)
+    add_colour_bar(drawing, image, axes, "poses", shrink=0.7)
     return finish_figure(
         drawing,
         f"{title}: how many of the {len(poses)} poses cover each part of the image. "

@@ -14,8 +14,8 @@ from slviewer.report.canvas import (
     SMALL_PT,
     SOFT,
     TITLE_PT,
+    add_legend,
     finish_figure,
-    legend,
     new_figure,
     style_axes,
     style_image_axes,
@@ -47,7 +47,7 @@ def planes_in_space(outlines: Mapping[str, np.ndarray], depth_range_mm: tuple[fl
         axes.set_title(title, fontsize=TITLE_PT, color=INK, loc="left", fontweight="bold", pad=18)
         _draw_profile(axes, axis, hulls, short, depth_range_mm, low, high)
         if not row:
-            legend(axes, loc="lower right", bbox_to_anchor=(1.0, 1.08), borderaxespad=0.2)
+            add_legend(axes, loc="lower right", bbox_to_anchor=(1.0, 1.08), borderaxespad=0.2)
     return finish_figure(
         drawing,
         f"Positions of the {len(hulls)} planes in the camera's frame. Shaded: R2, the calibrated depths of "

@@ -68,7 +68,7 @@ def write_bytes(path: Path, *parts: Any) -> None:
         os.fsync(file.fileno())
 
 
-def write_json(path: Path, data: Any) -> None:
+def write_synced_json(path: Path, data: Any) -> None:
     """Write a new JSON file and sync it. Takes what `records.to_plain` takes."""
     write_bytes(path, to_json(data))
 
@@ -178,9 +178,9 @@ class Together:
         self._root = root
         self._changes: dict[Path, tuple[Path | None, Path | None]] = {}  # target: (what replaces it, where it goes)
 
-    def replace(self, target: Path, folder: Path, old_to: Path | None = None) -> None:
-        """Let a folder, staged or from the trash, become ``target``, whose present one goes to ``old_to`` or is
-        deleted."""
+    def replace(self, target: Path, folder: Path | None, old_to: Path | None = None) -> None:
+        """Let a folder, staged or from the trash, or nothing become ``target``, whose present one goes to ``old_to`` or
+        is deleted."""
         replaced, first_to = self._changes.get(target, (None, None))
         self._changes[target] = folder, first_to or old_to
         if replaced is not None:
@@ -188,10 +188,7 @@ class Together:
 
     def move_away(self, target: Path, old_to: Path) -> None:
         """Let ``target`` go to ``old_to``; a folder staged for it is removed."""
-        replaced, first_to = self._changes.get(target, (None, None))
-        self._changes[target] = None, first_to or old_to
-        if replaced is not None:
-            discard(replaced)
+        self.replace(target, None, old_to)
 
     def folder_for(self, target: Path) -> Path:
         """Return where the content of ``target`` is now: a path that does not exist where it is to go."""

@@ -16,11 +16,11 @@ from slviewer.errors import DamagedError, InputError, SessionError
 from slviewer.fringe.hdr import choose_exposure, chosen, merge_exposures, peaks, pick
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.records.plain import from_plain
-from slviewer.session.atomic import to_json, write_bytes, write_json
+from slviewer.session.atomic import to_json, write_bytes, write_synced_json
 from slviewer.session.names import is_safe_name
 from slviewer.session.reading import decoding, read_json
 from slviewer.session.stack import (
-    check_frames,
+    check_stack_array,
     describe_stack,
     hash_frames,
     hash_stack,
@@ -233,7 +233,7 @@ class NewCapture:
     def check(self) -> None:
         """Raise InputError unless frames, exposures and texture fit the sequence and one another."""
         exposures, texture, shape = self.exposures_ms, self.texture, self.frames.shape
-        check_frames(self.frames)
+        check_stack_array(self.frames)
         if len(exposures) == 1 or len(set(exposures)) < len(exposures) or min(exposures, default=1) <= 0:
             raise InputError(f"exposures of {list(exposures)} ms: give two or more, each once, or none")
         if len(self.frames) != len(self.sequence.frames) * max(1, len(exposures)):
@@ -255,7 +255,7 @@ def write_capture(folder: Path, capture: NewCapture, role: Role, board: str | No
     described = capture.sequence.to_dict()
     if texture is not None:
         write_bytes(folder / "texture.png", _encode_png(texture))
-    write_json(
+    write_synced_json(
         folder / "capture.json",
         {
             "role": role,
@@ -274,7 +274,7 @@ def write_capture(folder: Path, capture: NewCapture, role: Role, board: str | No
     )
 
 
-def read_captures(folders: Iterable[Path]) -> tuple[list[Capture], dict[str, str]]:
+def read_stored_captures(folders: Iterable[Path]) -> tuple[list[Capture], dict[str, str]]:
     """The captures in these folders, and of every other {its name: what is wrong with it, and the remedy}."""
     captures, faults = [], {}
     for folder in folders:
@@ -305,7 +305,7 @@ def read_capture(folder: Path) -> Capture:
     return Capture(folder.name, described.role, sequence, described.camera.size, described.hash, folder, meta)
 
 
-def compare_captures(folder: Path, new: NewCapture, role: Role) -> Comparison:
+def compare_stored(folder: Path, new: NewCapture, role: Role) -> Comparison:
     """How the capture stored in a folder compares with a new one, checked, for that role."""
     if not folder.exists():
         return "absent"

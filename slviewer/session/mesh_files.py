@@ -103,12 +103,7 @@ def write_shape(
     path = Path(path)
     file_format = path.suffix.lower().removeprefix(".")
     points, faces = (shape.vertices, shape.faces) if isinstance(shape, Mesh) else (shape.points, None)
-    formats = point_formats() if faces is None else mesh_formats()
-    if file_format not in formats:
-        what = "a cloud" if faces is None else "a mesh"
-        why = ": it has no triangles" if file_format in mesh_formats() else ""
-        listed = ", ".join(f".{each}" for each in formats)
-        raise InputError(f"{path.name}: {what} cannot be written so{why}; choose one of {listed}")
+    _check_format(path, is_mesh=faces is not None)
     if not len(points) or (faces is not None and not len(faces)):
         raise InputError(f"{path.name} would be empty: there is nothing to write")
     if not np.isfinite(points).all():
@@ -130,6 +125,17 @@ def write_shape(
         encode = {"stl": _encode_stl, "obj": _encode_obj, "glb": _encode_glb, "3mf": _encode_3mf}[file_format]
         replace_file(path, encode(shape, notes))
     return path.stat().st_size
+
+
+def _check_format(path: Path, is_mesh: bool) -> None:
+    """Raise InputError unless points or meshes can be written in the format of the suffix."""
+    formats = mesh_formats() if is_mesh else point_formats()
+    file_format = path.suffix.lower().removeprefix(".")
+    if file_format not in formats:
+        what = "a mesh" if is_mesh else "a cloud"
+        why = ": it has no triangles" if file_format in mesh_formats() else ""
+        listed = ", ".join(f".{each}" for each in formats)
+        raise InputError(f"{path.name}: {what} cannot be written so{why}; choose one of {listed}")
 
 
 def write_textured(path: str | Path, shape: Mesh, uv: np.ndarray, image: np.ndarray, notes: Sequence[str] = ()) -> int:
@@ -166,23 +172,21 @@ def write_textured(path: str | Path, shape: Mesh, uv: np.ndarray, image: np.ndar
     return sum(each.stat().st_size for each in (path, mtl, png))
 
 
-def estimated_bytes(
-    file_format: str, points: int, faces: int = 0, *, colours: bool = True, normals: bool = True, scalars: int = 0
-) -> int:
+def estimated_bytes(file_format: str, points: int, faces: int = 0, *, colours: bool = True, scalars: int = 0) -> int:
     """Estimate the size of a file of so many points and faces: within 1 % of binary files, some 20 % of texts."""
     if file_format == "ply":
-        return 300 + points * (12 + 12 * normals + 3 * colours + 4 * scalars) + faces * FACE.itemsize
+        return 300 + points * (24 + 3 * colours + 4 * scalars) + faces * FACE.itemsize
     if file_format == "stl":
         return 84 + faces * FACET_BYTES
     if file_format == "glb":
-        return 1200 + points * (12 + 12 * normals + 4 * colours) + 12 * faces
+        return 1200 + points * (24 + 4 * colours) + 12 * faces
     if file_format == "e57":
         return 4000 + points * (12 + 3 * colours)
     if file_format == "3mf":
         return 1500 + 14 * points + 7 * faces
     if file_format == "obj":
-        vertex = 3 * _NUMBER + 2 + normals * (3 * _SMALL + 4) + 21 * colours
-        return 200 + points * vertex + faces * (3 + 3 * (1 + normals) * len(str(points)) + 6 * normals)
+        vertex = 3 * _NUMBER + 3 * _SMALL + 6 + 21 * colours
+        return 200 + points * vertex + faces * (9 + 6 * len(str(points)))
     return points * (3 * _NUMBER + 3 * _GREY * colours)
 
 

@@ -1,7 +1,7 @@
 """Names of captures and results: safe as folder names on every system, sorted as a person counts."""
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 from slviewer.errors import InputError
 
@@ -55,6 +55,11 @@ def clean_label(text: str) -> str:
     if not label.isprintable():
         raise InputError(f"{label!r} holds characters that cannot be printed: type the name again")
     return label
+
+
+def join_names(names: Sequence[str], most: int = 6) -> str:
+    """Format names for a sentence, the first few of many."""
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
 def natural_key(name: str) -> list[tuple[int, int, str]]:

@@ -25,6 +25,7 @@ MAX_DEPTH = 32
 _MAX_INTEGER = 1 << 63
 _LONE_SURROGATE = re.compile("[\ud800-\udfff]")
 _DEEP_KEY = re.compile(r"""(?<![\w"'-])(?:(?:[\w-]+|"[^"\n]*"|'[^'\n]*')[ \t]*\.[ \t]*){32}""")
+_REMEDY = "restore it from a copy, or compute or import it again"
 _INVALID = (KeyError, TypeError, ValueError, AttributeError, IndexError, ArithmeticError, RecursionError, MemoryError)
 """What a decoder raises that meets a value that it does not expect."""
 
@@ -89,15 +90,14 @@ def expand_user(path: Path | str) -> Path:
 def decoding(
     place: Path | str,
     error: Callable[[str], Exception] = DamagedError,
-    remedy: str = "restore it from a copy, or compute or import it again",
 ) -> Iterator[None]:
     """Context manager for decoding values read from ``place``: raise what unexpected ones cause as ``error``."""
     try:
         yield
     except InputError as fault:
-        raise error(f"{place} is damaged ({fault}): {remedy}") from fault
+        raise error(f"{place} is damaged ({fault}): {_REMEDY}") from fault
     except _INVALID as fault:
-        raise error(f"{place} is damaged ({type(fault).__name__}: {_reason(fault)}): {remedy}") from fault
+        raise error(f"{place} is damaged ({type(fault).__name__}: {_reason(fault)}): {_REMEDY}") from fault
 
 
 def _check_values(data: Any) -> Any:

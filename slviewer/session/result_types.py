@@ -19,8 +19,6 @@ Extent = Annotated[int, msgspec.Meta(ge=1, le=1 << 16)]
 Size = tuple[Extent, Extent]
 _Triple = tuple[float, float, float]
 _Matrix3 = tuple[_Triple, _Triple, _Triple]
-_Row4 = tuple[float, float, float, float]
-_Matrix4 = tuple[_Row4, _Row4, _Row4, _Row4]
 _Count = Annotated[int, msgspec.Meta(ge=0)]
 _Exposure = Annotated[float, msgspec.Meta(gt=0, lt=1e9)]
 

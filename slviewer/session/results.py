@@ -18,7 +18,7 @@ import google_crc32c
 import numpy as np
 
 from slviewer.errors import DamagedError, InputError
-from slviewer.session.atomic import to_json, write_bytes, write_json
+from slviewer.session.atomic import to_json, write_bytes, write_synced_json
 from slviewer.session.layout import inner_folders
 from slviewer.session.names import safe_path
 from slviewer.session.reading import decoding, open_regular, read_file, read_json
@@ -78,7 +78,7 @@ def write_result(folder: Path, meta: Mapping[str, Any], arrays: Mapping[str, np.
         digests = dict(zip(names, pool.map(write, names), strict=True))
     content_hash = _combine_digests(meta, {name: digest for name, (digest, _) in digests.items()})
     checksums = {name: checksum for name, (_, checksum) in digests.items()}
-    write_json(folder / "meta.json", {**meta, "hash": content_hash, "arrays": names, "checksums": checksums})
+    write_synced_json(folder / "meta.json", {**meta, "hash": content_hash, "arrays": names, "checksums": checksums})
 
 
 def read_meta(folder: Path) -> dict[str, Any]:

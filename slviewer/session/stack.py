@@ -37,7 +37,7 @@ def write_stack(path: Path, frames: np.ndarray) -> str:
 
     Raises InputError for any other shape or type.
     """
-    check_frames(frames)
+    check_stack_array(frames)
     _create_array(path, frames.shape, _DTYPES[frames.dtype])
 
     def write(index: int) -> bytes:
@@ -220,7 +220,7 @@ class _StoredStack:
         )
 
 
-def check_frames(frames: np.ndarray) -> None:
+def check_stack_array(frames: np.ndarray) -> None:
     """Raise InputError unless `frames` is a stack (n, h, w) of uint8 or uint16 with something in it."""
     if not isinstance(frames, np.ndarray) or frames.ndim != 3 or frames.size == 0:
         raise InputError(f"a stack of frames (n, h, w) is needed, got shape {np.shape(frames)}")

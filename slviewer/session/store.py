@@ -16,9 +16,9 @@ from slviewer.session.capture import (
     Comparison,
     NewCapture,
     Role,
-    compare_captures,
+    compare_stored,
     read_capture,
-    read_captures,
+    read_stored_captures,
     write_capture,
 )
 from slviewer.session.decisions import Decisions
@@ -148,11 +148,11 @@ class Session(Decisions):
 
     def read_captures(self) -> tuple[list[Capture], dict[str, str]]:
         """The captures, and of every other folder in their place {name: what is wrong with it, and the remedy}."""
-        return read_captures([self.folder / "captures" / name for name in self.taken_names()])
+        return read_stored_captures([self.folder / "captures" / name for name in self.taken_names()])
 
     def compare_capture(self, new: NewCapture, role: Role) -> Comparison:
         """How the capture of the name of `new`, checked, compares with it."""
-        return compare_captures(self._capture_folder(new.name), new, role)
+        return compare_stored(self._capture_folder(new.name), new, role)
 
     def load_capture(self, name: str) -> Capture:
         """A capture; its frames stay on disk until they are read. InputError where it does not exist."""

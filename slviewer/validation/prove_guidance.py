@@ -24,7 +24,7 @@ from slviewer.simulation.truth import PerfectModel
 from slviewer.target.board import Board
 from slviewer.validation.proof import Proof, root_mean_square, track
 from slviewer.validation.rendered_calibration import calibrate_observed, observe_rendered, render_phase
-from slviewer.wizard.pose_plan import PlanInput, PoseFeatures, plan
+from slviewer.wizard.pose_plan import PlanInput, PoseFeatures, plan_next_pose
 
 BOARD = Board.parse(TARGET)
 POSES, RIGS = 12, 5
@@ -122,7 +122,7 @@ def _observe_guided(rig: SimulatedRig, count: int, report: Progress) -> tuple[li
     refused = 0
     while True:
         features = {o.name: _extract_features(o) for o in observations}
-        planned = plan(PlanInput(BOARD, rig.camera.size, rig.projector.size, features, refused=refused))
+        planned = plan_next_pose(PlanInput(BOARD, rig.camera.size, rig.projector.size, features, refused=refused))
         if len(observations) == count:
             return observations, planned.sigma_mm
         i = len(observations) + refused

@@ -22,7 +22,7 @@ from slviewer.errors import Cancelled, DeviceError, SlviewerError, TurntableErro
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.pipeline.feedback import Progress
 from slviewer.wizard.live_frames import Stream
-from slviewer.wizard.notices import Notices, describe_error
+from slviewer.wizard.notices import Notices, describe_failure
 from slviewer.wizard.snapshot import CaptureProgress, RigView
 
 RETRY_S = 2.0
@@ -405,7 +405,7 @@ class Acquisition:
 
     def _handle_fault(self, error: Exception) -> None:
         """Report a device fault, close the devices, drop waiting requests and end the stream."""
-        text = describe_error("the rig", error)
+        text = describe_failure("the rig", error)
         self._close_devices()
         with self._condition:
             first = not self._view.fault
@@ -428,7 +428,7 @@ class Acquisition:
             try:
                 self._rig.close()
             except Exception as error:  # no device may end the thread that could open it again
-                describe_error("closing the rig", error)
+                describe_failure("closing the rig", error)
 
     def _update_view(self, **changes: Any) -> None:
         """Replace fields of the rig's view, unless another rig was chosen meanwhile, and notify."""

@@ -33,12 +33,12 @@ from slviewer.wizard.acquisition import Acquisition
 from slviewer.wizard.diagnostics import LogKeeper
 from slviewer.wizard.jobs import Jobs, Reporter
 from slviewer.wizard.live_scan import LiveCloud, LiveScan
-from slviewer.wizard.notices import Notices, describe_error
+from slviewer.wizard.notices import Notices, describe_failure
 from slviewer.wizard.planner import Planner
-from slviewer.wizard.pose_plan import plan
+from slviewer.wizard.pose_plan import plan_next_pose
 from slviewer.wizard.preview_watcher import HandsFree, Watch, Watcher
 from slviewer.wizard.publisher import Listeners, Publisher
-from slviewer.wizard.result_views import thumbnail
+from slviewer.wizard.result_views import make_thumbnail
 from slviewer.wizard.session_reader import SessionReader
 from slviewer.wizard.snapshot import (
     Brightness,
@@ -87,7 +87,7 @@ class Engine:
         self.publisher = Publisher(self._build_snapshot, empty, timing.retry_s)
         self.notices = Notices(self.publisher.mark_changed)
         self.jobs = Jobs(self.notices, self.publisher.mark_changed)
-        compute = partial(plan, trials=timing.trials)
+        compute = partial(plan_next_pose, trials=timing.trials)
         self._planner = Planner(lambda: self.publisher.mark_changed(session=True), compute)
         self.watcher = Watcher(self._handle_preview)
         self.acquisition = Acquisition(
@@ -311,7 +311,7 @@ class Engine:
         if capture.name not in reader.session.capture_names():
             return  # deleted since
         if not reader.has_thumbnail(capture):
-            reader.add_thumbnail(capture, thumbnail(capture))
+            reader.add_thumbnail(capture, make_thumbnail(capture))
             self.publisher.mark_changed(session=True)
         session = reader.session.guarded(report.saving)
         report(0.0, f"reading {capture.name}")
@@ -366,29 +366,20 @@ class Engine:
     def _build_snapshot(self, version: int, session_changed: bool) -> Snapshot:
         """Build the current snapshot without changing any state (publisher's thread)."""
         reader, bench, choice, rig = self._reader, self.bench, self._choice, self.acquisition.view()
-        session, read_failure = self.publisher.latest.session, self.publisher.latest.read_failure
-        if reader is None or (session is not None and session.folder != reader.session.folder):
+        session, space, read_failure = self.publisher.latest.session, None, self.publisher.latest.read_failure
+        if reader is None:
             session = None
-        if reader is not None and (session_changed or session is None):
-            read_failure = ""
+        else:
+            if session_changed or session is None or session.folder != reader.session.folder:
+                session, read_failure = self._read_session(reader, rig, session)
             try:
-                session = reader.read(rig, bench.focal_px if bench else None)
-            except Exception as error:  # most likely files were being changed
-                read_failure = describe_error("Reading the session", error)
-        space = None
-        try:
-            if reader is not None:
                 camera = bench.rig.camera if bench is not None and rig.camera is not None else None
                 space = measure_space(reader.session, camera, reader.count_frames(rig))
-        except (SlviewerError, OSError) as error:
-            read_failure = read_failure or describe_error("Reading the session", error)
+            except (SlviewerError, OSError) as error:
+                read_failure = read_failure or describe_failure("Reading the session", error)
         if self._rig_fault:
             rig = replace(rig, state="lost", fault=self._rig_fault)
-        world = None
-        if bench is not None and bench.world is not None:
-            T, pose = np.eye(4), bench.world.pose
-            T[:3, :3], T[:3, 3] = pose.R, pose.t
-            world = WorldView(bench.world.standing, T, bench.world.turn_deg)
+        world = _view_world(bench.world) if bench is not None and bench.world is not None else None
         rig = replace(
             rig, simulated=world is not None, choice=choice, pages=() if choice is None else list_needed_pages(choice)
         )
@@ -411,6 +402,16 @@ class Engine:
             read_failure=read_failure,
             preparing=self._preparing,
         )
+
+    def _read_session(
+        self, reader: SessionReader, rig: RigView, before: SessionView | None
+    ) -> tuple[SessionView | None, str]:
+        """Return (the session, ""); where it cannot be read, (`before` if it is of the same folder, why)."""
+        try:
+            return reader.read(rig, self.bench.focal_px if self.bench else None), ""
+        except Exception as error:  # most likely files were being changed
+            is_same = before is not None and before.folder == reader.session.folder
+            return before if is_same else None, describe_failure("Reading the session", error)
 
     def _follow_up(self, snapshot: Snapshot) -> None:
         """Act on a new snapshot: retry failed reads, plan the next pose, end hands-free capture."""
@@ -435,6 +436,13 @@ class Engine:
         if session.enough and reached != self._reached and self.hands_free.is_on:
             self.hands_free.switch(False)
             self.notices.add("good", "the poses reach the wanted accuracy: hands-free capture has stopped")
+
+
+def _view_world(world: SimulatedWorld) -> WorldView:
+    """Return what stands before the simulated rig, and its pose."""
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = world.pose.R, world.pose.t
+    return WorldView(world.standing, T, world.turn_deg)
 
 
 def _choose_watch(session: SessionView | None) -> Watch:

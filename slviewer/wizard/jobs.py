@@ -197,9 +197,7 @@ class Jobs:
     def wait_until_idle(self, timeout_s: float) -> bool:
         """Wait until no job runs or waits; returns False after `timeout_s`."""
         with self._condition:
-            return self._condition.wait_for(
-                lambda: self._running is None and not self._waiting and not self._waiting_behind, timeout_s
-            )
+            return self._condition.wait_for(lambda: self.idle, timeout_s)
 
     def close(self) -> None:
         """Cancel everything and end the worker; returns within a second or so."""

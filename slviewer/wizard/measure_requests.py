@@ -59,7 +59,7 @@ class MeasureRequests(RequestHandler):
             surface = self._surfaces.load(store, on)
             return add(store.guarded(report.saving), surface, *args, **kwargs)
 
-        self._submit(MEASURING, work, describe_measurement)
+        self._submit(MEASURING, work, describe_quantities)
 
     @request(MEASURING)
     def measure_between(self, a: str, b: str) -> None:
@@ -70,7 +70,7 @@ class MeasureRequests(RequestHandler):
             """Add and return the relation of the two measurements."""
             return measurements.add_relation(store.guarded(report.saving), a, b)
 
-        self._submit(MEASURING, work, describe_measurement)
+        self._submit(MEASURING, work, describe_quantities)
 
     @request("Reading the nominal model")
     def upload_nominal(self, name: str, content: bytes) -> None:
@@ -182,7 +182,7 @@ class MeasureRequests(RequestHandler):
             report(1.0, "compared")
             return result
 
-        self._submit(COMPARING, work, describe_comparison)
+        self._submit(COMPARING, work, describe_deviation)
 
     @request("Renaming")
     def relabel_measurement(self, identity: str, name: str) -> None:
@@ -241,7 +241,7 @@ def _reword_errors() -> Iterator[None]:
         raise InputError(str(error).replace("give --units ", "choose its units, ").replace("--units ", "")) from error
 
 
-def describe_measurement(measured: Measurement) -> str:
+def describe_quantities(measured: Measurement) -> str:
     """Describe a measurement in one sentence: its name and quantities."""
     values = "; ".join(quantity.text() for quantity in measured.quantities)
     return f"{measured.name}: {values}"
@@ -253,7 +253,7 @@ def describe_inspection(inspection: Inspection) -> str:
     return f"{inspection.plan.name}: {failure or f'all {len(inspection.parts)} parts pass'}"
 
 
-def describe_comparison(result: NominalComparison) -> str:
+def describe_deviation(result: NominalComparison) -> str:
     """Describe a comparison in one sentence: RMS deviation in mm, and the decision against the tolerance."""
     text = f"{result.scan} against {result.nominal.name}: RMS {result.found.statistics()['rms']:.4f} mm"
     if result.verdict is None:

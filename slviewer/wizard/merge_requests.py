@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 from slviewer.errors import InputError, SlviewerError
 from slviewer.pipeline.merge import MergeSettings, Picked, StartKind, merge
 from slviewer.registration.refusal import Refused
-from slviewer.wizard.notices import describe_error
+from slviewer.wizard.notices import describe_failure
 from slviewer.wizard.requests import RequestHandler, request
 
 MERGING = "Merging"
@@ -57,7 +57,7 @@ class MergeRequests(RequestHandler):
 
         def failed(error: BaseException) -> None:
             """Store and report why the merge failed, and suggest another initial alignment where that may help."""
-            text = describe_error(MERGING, error)
+            text = describe_failure(MERGING, error)
             if isinstance(error, Refused) and error.reason in ("overlap", "disagree"):
                 text = f"{text} {_ALTERNATIVES[start]}"
             reason = error.reason if isinstance(error, Refused) else None

@@ -33,8 +33,8 @@ class Notices:
         self._changed()
 
     def add_failure(self, action: str, error: BaseException) -> None:
-        """Add what `describe_error` returns for the error that ended an action ("Calibrating")."""
-        self.add("error", describe_error(action, error))
+        """Add what `describe_failure` returns for the error that ended an action ("Calibrating")."""
+        self.add("error", describe_failure(action, error))
 
     def all(self) -> tuple[Notice, ...]:
         """Return the latest notices, oldest first."""
@@ -42,7 +42,7 @@ class Notices:
             return tuple(self._latest)
 
 
-def describe_error(action: str, error: BaseException) -> str:
+def describe_failure(action: str, error: BaseException) -> str:
     """Describe an error to the operator in one sentence; an unexpected one is logged with its traceback."""
     if isinstance(error, SlviewerError):
         return str(error)

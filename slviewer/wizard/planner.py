@@ -5,7 +5,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from slviewer.wizard.notices import log
-from slviewer.wizard.pose_plan import PlanInput, PosePlan, plan, quick_plan
+from slviewer.wizard.pose_plan import PlanInput, PosePlan, plan_next_pose, quick_plan
 from slviewer.wizard.preview_watcher import LatestWorker
 
 MOST_PLANS = 8
@@ -15,13 +15,13 @@ MOST_PLANS = 8
 class Planner:
     """Provides the best plan available; `changed()` is called, on the planner's thread, when a better one is ready.
 
-    Only the latest request is computed. `compute` and `quick` are `plan` and `quick_plan`.
+    Only the latest request is computed. `compute` and `quick` are `plan_next_pose` and `quick_plan`.
     """
 
     def __init__(
         self,
         changed: Callable[[], None],
-        compute: Callable[[PlanInput], PosePlan] = plan,
+        compute: Callable[[PlanInput], PosePlan] = plan_next_pose,
         quick: Callable[[PlanInput, PosePlan | None], PosePlan] = quick_plan,
     ) -> None:
         self._changed, self._compute, self._quick = changed, compute, quick

@@ -79,7 +79,7 @@ class PlanInput:
 
     @property
     def takes_time(self) -> bool:
-        """Whether `plan` evaluates a rig's information matrix (slow), rather than coverage alone."""
+        """Whether `plan_next_pose` evaluates a rig's information matrix (slow), rather than coverage alone."""
         return self.calibrated is not None or len(self.features) >= MIN_POSES_FOR_RIG
 
     def initial_lens(self) -> Lens:
@@ -119,7 +119,7 @@ class PosePlan:
         return self.sigma_mm is not None and self.sigma_mm <= wanted_mm and len(self.poses) >= MIN_POSES
 
 
-def plan(given: PlanInput, trials: int = TRIALS) -> PosePlan:
+def plan_next_pose(given: PlanInput, trials: int = TRIALS) -> PosePlan:
     """Plan the next pose by information gain, from ``trials`` drawn candidates.
 
     The rig is the calibrated one, else one estimated from the poses.

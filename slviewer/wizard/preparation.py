@@ -81,7 +81,7 @@ def prepared_file() -> Path | None:
     return root / f"prepared-{hash_sources(__name__)}-{hashlib.blake2b(compiler.encode(), digest_size=8).hexdigest()}"
 
 
-def main() -> None:
+def prepare() -> None:
     """Run the wizard once on a small rig, and print the share that is done; ends when standard input is closed."""
     threading.Thread(target=_exit_with_parent, daemon=True).start()
     if hasattr(os, "nice"):
@@ -109,4 +109,4 @@ def _exit_with_parent() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    prepare()

@@ -146,7 +146,7 @@ class Watcher:
         watch, board = self._watch, None
         thumbnail = reduced(image, _THUMBNAIL_PX)[0]
         if self._searched is None or self._searched[0] != watch.board or _differs(thumbnail, self._searched[1]):
-            self._searched, self._detected = (watch.board, thumbnail), detect_board(watch.board, image)
+            self._searched, self._detected = (watch.board, thumbnail), detect_in_preview(watch.board, image)
         detection, missing = self._detected
         if detection is not None and watch.board is not None:
             # centres of reduced pixels to those of the camera's
@@ -199,7 +199,7 @@ def brightness(frame: np.ndarray, full_scale: int | None = None) -> tuple[float,
     return float(by_level[int(top) :].sum()) / some.size, brightest / top, shares
 
 
-def detect_board(board: Board | None, image: np.ndarray) -> tuple[Detection | None, str]:
+def detect_in_preview(board: Board | None, image: np.ndarray) -> tuple[Detection | None, str]:
     """Detect the board in a reduced image; returns (detection, "") or (None, why it was not detected)."""
     if board is None:
         return None, ""

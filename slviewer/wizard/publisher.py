@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Generic, TypeVar
 
-from slviewer.wizard.notices import describe_error, log
+from slviewer.wizard.notices import describe_failure, log
 from slviewer.wizard.snapshot import Snapshot
 
 PAUSE_S = 0.05
@@ -124,7 +124,7 @@ class Publisher:
             try:
                 snapshot = self._build(version, session)
             except Exception as error:
-                failure = describe_error("Updating the page", error)
+                failure = describe_failure("Updating the page", error)
                 snapshot = replace(self.latest, version=version, read_failure=failure)
             with self._condition:
                 self.latest = snapshot

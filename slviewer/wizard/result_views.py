@@ -28,7 +28,7 @@ THUMBNAIL_PX = 240
 @dataclass(frozen=True, eq=False)
 class ScanCloud:
     """A reconstructed capture on the camera's grid: `points` (h, w, 3) float32 mm and `sigma_z`, `phase` (rad),
-    `modulation` (h, w) float32, NaN where invalid; `texture` (h, w) or (h, w, 3) uint8; `errors` as in `error_maps`.
+    `modulation` (h, w) float32, NaN where invalid; `texture` (h, w) or (h, w, 3) uint8; `errors` of `load_error_maps`.
     `sigma_calibration` (h, w) float32 mm is what the calibration's own uncertainty adds, `sigma_edges` what blur at
     edges does; None where it is not known.
     """
@@ -69,7 +69,7 @@ def nearest(points: np.ndarray, origin: np.ndarray, direction: np.ndarray) -> tu
     return tuple(int(i) for i in index) if np.isfinite(score[index]) else None
 
 
-def scan_cloud(session: Session, name: str) -> ScanCloud:
+def load_scan_cloud(session: Session, name: str) -> ScanCloud:
     """Load the reconstructed cloud of a capture, of a scan without what edits and region remove.
 
     Raises InputError where it was not reconstructed, or nothing remains of it.
@@ -88,11 +88,11 @@ def used_points(session: Session, cloud: ScanCloud) -> ScanCloud:
 def whole_cloud(session: Session, name: str) -> ScanCloud:
     """Load the reconstructed cloud of a capture with all of its points. Raises InputError where there is none."""
     meta, arrays = session.load_result(f"clouds/{name}")
-    errors = error_maps(session, name) if f"verify/{name}" in session.result_names() else {}
+    errors = load_error_maps(session, name) if f"verify/{name}" in session.result_names() else {}
     return ScanCloud(name=name, model=meta["model"], axis=meta["axis"], errors=errors, **arrays)
 
 
-def error_maps(session: Session, name: str) -> dict[str, np.ndarray]:
+def load_error_maps(session: Session, name: str) -> dict[str, np.ndarray]:
     """Load {model: (h, w) float32 mm} signed distances from the fitted plane or sphere, NaN where not measured."""
     arrays = session.load_result(f"verify/{name}")[1]
     return {key.removeprefix("error_"): array for key, array in arrays.items()}
@@ -128,7 +128,7 @@ def pixel_curve(session: Session, pixel: tuple[int, int], axis: Axis) -> PixelCu
     return curve_at(pixel, model, stereo, load_observations(session, list(stereo.poses)), axis)
 
 
-def thumbnail(capture: Capture) -> bytes:
+def make_thumbnail(capture: Capture) -> bytes:
     """Return a small JPEG of the capture's texture, or of its brightest kind of frame where it has none."""
     order = ("texture", "white", "phase", "gray")
     frames = capture.sequence.frames

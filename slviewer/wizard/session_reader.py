@@ -38,13 +38,13 @@ from slviewer.session.capture import Capture
 from slviewer.session.inspection_plan import Characteristic, list_plans
 from slviewer.session.measurements import FOLDER as MEASUREMENTS
 from slviewer.session.measurements import NAMES, Measurement, measurement_from_meta
-from slviewer.session.names import natural_key
+from slviewer.session.names import join_names, natural_key
 from slviewer.session.scan_edits import list_edits, load_region, restriction_inputs
 from slviewer.session.store import Session
 from slviewer.target.board import Board
 from slviewer.wizard.calibration_views import load_fit_rms, load_splined
 from slviewer.wizard.export_files import list_exports
-from slviewer.wizard.notices import describe_error
+from slviewer.wizard.notices import describe_failure
 from slviewer.wizard.planner import Planner
 from slviewer.wizard.pose_plan import PlanInput, PoseFeatures, PosePlan
 from slviewer.wizard.snapshot import (
@@ -159,16 +159,8 @@ class SessionReader:
         self._faults = [*faults.values(), *session.decision_faults(), *filter(None, [unknown])]
         captures = {capture.name: capture for capture in sound}
         calibration = self._attempt("the calibration", lambda: self._read_calibration(captures), None)
-        models = calibration.models if calibration else ()
         scans = [capture.name for capture in sound if capture.role == "scan"]
-        cuts = self._attempt("edits and region", lambda: restriction_inputs(session, scans), dict[str, str]())
-        hashes = cuts | {name: capture.hash for name, capture in captures.items()}
-        for name in (f"calibration/{model}" for model in models):
-            meta = self._load_meta(name)
-            if not _has_changed(meta["inputs"], hashes):
-                hashes[name] = meta["hash"]
-        factors = {model: scale_factor(session, model) for model in models}
-        inputs = _Inputs(captures, session.valid_decision("names") or {}, hashes, factors)
+        inputs = self._read_inputs(captures, scans, calibration.models if calibration else ())
         poses, plan, pending = self._read_poses(captures, target, calibration, rig, focal_px)
         records = self._read_records(inputs)
         of_scan = {name: [each for each in records if each.name == name] for name in scans}
@@ -203,12 +195,24 @@ class SessionReader:
             faults=tuple(dict.fromkeys(self._faults)),
         )
 
+    def _read_inputs(self, captures: Mapping[str, Capture], scans: Sequence[str], models: Sequence[str]) -> _Inputs:
+        """Read the current inputs of results: captures, edits of scans, and calibrations of these models."""
+        session = self.session
+        cuts = self._attempt("edits and region", lambda: restriction_inputs(session, scans), dict[str, str]())
+        hashes = cuts | {name: capture.hash for name, capture in captures.items()}
+        for name in (f"calibration/{model}" for model in models):
+            meta = self._load_meta(name)
+            if not _has_changed(meta["inputs"], hashes):
+                hashes[name] = meta["hash"]
+        factors = {model: scale_factor(session, model) for model in models}
+        return _Inputs(captures, session.valid_decision("names") or {}, hashes, factors)
+
     def _attempt(self, what: str, read: Callable[[], T], otherwise: T) -> T:
         """Return what `read()` returns, or `otherwise` where that fails, which is one of the session's faults then."""
         try:
             return read()
         except Exception as error:  # damaged files may make their reader fail in any way
-            self._faults.append(describe_error(f"Reading {what}", error))
+            self._faults.append(describe_failure(f"Reading {what}", error))
             return otherwise
 
     # poses
@@ -231,22 +235,14 @@ class SessionReader:
     ) -> tuple[tuple[PoseView, ...], PosePlan | None, PlanInput | None]:
         """Return (the poses, the plan after them, the input of the final plan where this one is interim)."""
         poses = [capture for capture in captures.values() if capture.role == "calibration"]
-        judged = {pose.name: self._load_judgement(pose, target) if target else None for pose in poses}
+        judged = {pose.name: self._load_judgement(pose, target) for pose in poses}
         states = {pose.name: self._determine_pose_state(pose, target, judged[pose.name], calibration) for pose in poses}
         camera, projector = (poses[0].size, poses[0].sequence.projector_size) if poses else (rig.camera, rig.projector)
         plan = given = None
         is_final = True
         if target and camera is not None and projector is not None:
-            features = {}
-            for pose in poses:
-                meta, early = judged[pose.name], self._features.get((pose.hash, target))
-                if states[pose.name][0] in ("excluded", "refused"):
-                    continue
-                if meta is not None:
-                    read = partial(self._load_features, pose.name, meta["hash"])
-                    early = self._attempt(f"the features of {pose.name}", read, None)
-                if early is not None:
-                    features[pose.name] = early
+            usable = [pose for pose in poses if states[pose.name][0] not in ("excluded", "refused")]
+            features = self._read_features(usable, target, judged)
             stereo = None if calibration is None or calibration.refused else calibration.stereo
             hashes = [(name, captures[name].hash) for name in features]
             if stereo is not None:
@@ -256,25 +252,31 @@ class SessionReader:
                 Board.parse(target), camera, projector, features, stereo, focal_px, refused, tuple(hashes)
             )
             plan, is_final = self._planner.look_up(given)
-        views = []
-        for pose in poses:
-            state, why = states[pose.name]
-            T = plan.poses.get(pose.name) if plan else None
-            rms = calibration.stereo.pose_rms_px.get(pose.name) if calibration and state == "used" else None
-            views.append(
-                PoseView(
-                    name=pose.name,
-                    state=state,
-                    why=why,
-                    created=str(pose.meta.get("created", "")),
-                    T_camera_board=T,
-                    calibrated=state == "used",
-                    board_px=None if plan is None or T is None else outline_px(Board.parse(target), plan.lens, T),
-                    rms_px=rms,
-                    thumbnail=self._thumbnails.get(pose.hash, b""),
-                )
-            )
-        return tuple(views), plan, None if is_final else given
+        views = tuple(self._view_pose(pose, *states[pose.name], target, plan, calibration) for pose in poses)
+        return views, plan, None if is_final else given
+
+    def _view_pose(
+        self,
+        pose: Capture,
+        state: PoseState,
+        why: str,
+        target: str,
+        plan: PosePlan | None,
+        calibration: CalibrationView | None,
+    ) -> PoseView:
+        """Return the view of a target pose: its state, and where the board is by the plan."""
+        T = plan.poses.get(pose.name) if plan else None
+        return PoseView(
+            name=pose.name,
+            state=state,
+            why=why,
+            created=str(pose.meta.get("created", "")),
+            T_camera_board=T,
+            calibrated=state == "used",
+            board_px=None if plan is None or T is None else outline_px(Board.parse(target), plan.lens, T),
+            rms_px=calibration.stereo.pose_rms_px.get(pose.name) if calibration and state == "used" else None,
+            thumbnail=self._thumbnails.get(pose.hash, b""),
+        )
 
     def _determine_pose_state(
         self, pose: Capture, target: str, meta: Mapping[str, Any] | None, calibration: CalibrationView | None
@@ -296,6 +298,20 @@ class SessionReader:
             if why and not why.startswith("excluded by the operator"):  # such a pose was included again since
                 return "unused", why
         return "good", ""
+
+    def _read_features(
+        self, poses: Sequence[Capture], target: str, judged: Mapping[str, Mapping[str, Any] | None]
+    ) -> dict[str, PoseFeatures]:
+        """Return the features of poses by name, those seen early until a pose is judged; poses without are missing."""
+        features = {}
+        for pose in poses:
+            seen, meta = self._features.get((pose.hash, target)), judged[pose.name]
+            if meta is not None:
+                load = partial(self._load_features, pose.name, meta["hash"])
+                seen = self._attempt(f"the features of {pose.name}", load, None)
+            if seen is not None:
+                features[pose.name] = seen
+        return features
 
     def _load_features(self, name: str, content_hash: str) -> PoseFeatures:
         """Load the features of a pose and the median noise of its projector coordinates; cached by content hash."""
@@ -358,9 +374,8 @@ class SessionReader:
         dropped = [n for n in inputs if n in excluded]
         for names, change in ((gone, "retaken or deleted"), (dropped, "excluded")):
             if names:
-                more = f" and {len(names) - 3} more" if len(names) > 3 else ""
                 verb = "was" if len(names) == 1 else "were"
-                return f"{', '.join(names[:3])}{more} {verb} {change} since: calibrate again"
+                return f"{join_names(names, 3)} {verb} {change} since: calibrate again"
         return ""
 
     # verifications, scans, merges, measurements

@@ -108,6 +108,16 @@ class RigView:
     notes: tuple[str, ...] = ()  # settings that its camera refused
     turntable: str = ""  # its name; empty: the rig has none
 
+    @property
+    def is_idle(self) -> bool:
+        """Whether it is open, and nothing is captured."""
+        return self.state == "open" and self.capture is None
+
+    @property
+    def is_recorded(self) -> bool:
+        """Whether its captures are those of a recording."""
+        return self.choice is not None and self.choice.get("driver") == "replay"
+
 
 @dataclass(frozen=True, eq=False)
 class PoseView:
@@ -186,6 +196,11 @@ class ScanView:
     turn_step: TurnStep | None = None  # of a turn on a turntable
     edits: tuple[str, ...] = ()  # that are in effect, in words
     undone_edits: int = 0  # which can be redone
+
+    @property
+    def is_placed(self) -> bool:
+        """Whether the scan is in its place beside others."""
+        return self.placement is not None and self.placement.is_good
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from slviewer.pipeline.models import POSES_FOR_PIXELWISE
 from slviewer.records.merge import MIN_OVERLAP
 from slviewer.records.verification import Verification
 from slviewer.session.atomic import format_bytes
+from slviewer.session.names import join_names
 from slviewer.wizard.snapshot import Brightness, CalibrationView, RigView, SessionView, StepState, StepView
 
 COVERED, MANY_POSES = 0.75, 15
@@ -250,7 +251,7 @@ def _verify_problems(facts: Facts) -> Iterator[str]:
     """Yield capture problems, and verifications of an older calibration."""
     yield from _capture_problems(facts)
     if stale := [each.name for each in facts.session.list_records(Verification) if each.stale] if facts.session else []:
-        yield f"{_join_names(stale)} measured with an older calibration: measure again."
+        yield f"{join_names(stale, 3)} measured with an older calibration: measure again."
 
 
 def _scan_instruction(facts: Facts) -> str:
@@ -330,7 +331,7 @@ def _measure_instruction(facts: Facts) -> str:
 def _measure_problems(facts: Facts) -> Iterator[str]:
     """Yield the stale measurements, whose surface has changed."""
     if stale := [measured.name for measured in facts.session.measurements if measured.stale] if facts.session else []:
-        yield f"{_join_names(stale)}: the measured surface has changed; measure again."
+        yield f"{join_names(stale, 3)}: the measured surface has changed; measure again."
 
 
 def _export_instruction(facts: Facts) -> str:
@@ -338,11 +339,6 @@ def _export_instruction(facts: Facts) -> str:
     if exports := facts.session.exports if facts.session else ():
         return f"{format_count(len(exports), 'file')} to download."
     return "Choose what to write: a cloud, a mesh, the calibration, the report."
-
-
-def _join_names(names: list[str]) -> str:
-    """Join the first three names with commas; further ones are counted."""
-    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
 
 
 STEPS = (

@@ -9,7 +9,7 @@ from slviewer.calibration.guidance.information import RigInformation, VolumeSens
 from slviewer.calibration.guidance.pose_selection import suggest_poses
 from slviewer.calibration.next_pose import depth_range
 from slviewer.geometry.rig import StereoRig
-from slviewer.wizard.pose_plan import MIN_POSES, PlanInput, PoseFeatures, plan
+from slviewer.wizard.pose_plan import MIN_POSES, PlanInput, PoseFeatures, plan_next_pose
 
 
 @pytest.fixture(scope="module")
@@ -99,7 +99,7 @@ def test_a_plan_asks_until_the_wanted_sigma_is_reached(true, seen) -> None:
     sizes = true.camera.size, true.projector.size
     features = {f"pose_{i:02d}": PoseFeatures(*each) for i, each in enumerate(seen)}
     nothing, few, many = (
-        plan(PlanInput(BOARD, *sizes, dict(list(features.items())[:n])), trials=16) for n in (0, 4, MIN_POSES)
+        plan_next_pose(PlanInput(BOARD, *sizes, dict(list(features.items())[:n])), trials=16) for n in (0, 4, MIN_POSES)
     )
     assert nothing.sigma_mm is None and nothing.suggestion is not None and not nothing.reaches(1.0)
     assert few.sigma_mm is not None and many.sigma_mm is not None and few.sigma_mm > many.sigma_mm > 0.001
@@ -107,6 +107,6 @@ def test_a_plan_asks_until_the_wanted_sigma_is_reached(true, seen) -> None:
     assert not few.reaches(2 * few.sigma_mm)  # too few to tell whether all is as it should be
     assert many.reaches(1.01 * many.sigma_mm) and not many.reaches(0.99 * many.sigma_mm)
     assert 0.01 < many.usual_mm < 0.04
-    refused = plan(PlanInput(BOARD, *sizes, dict(list(features.items())[:4]), refused=1), trials=16)
+    refused = plan_next_pose(PlanInput(BOARD, *sizes, dict(list(features.items())[:4]), refused=1), trials=16)
     assert refused.suggestion is not None and few.suggestion is not None
     assert not np.allclose(refused.suggestion.T_camera_board, few.suggestion.T_camera_board)

@@ -37,7 +37,7 @@ from slviewer.simulation.rig import letter
 from slviewer.simulation.turning import turn_pose, turning
 from slviewer.validation.bench_live import true_calibration
 from slviewer.wizard.operator import Operator
-from slviewer.wizard.result_views import scan_cloud, whole_cloud
+from slviewer.wizard.result_views import load_scan_cloud, whole_cloud
 
 pytestmark = [pytest.mark.computes, pytest.mark.slow]
 
@@ -175,7 +175,7 @@ def test_points_are_selected_deleted_and_restored(wizard: tuple[Opened, App, Ope
     (edit,) = load_edits(operator.session, "one").active
     assert edit.pixels is not None and edit.pixels[v, u] and edit.points == selected
     expect(page.get_by_text(re.compile(f"{selected:,} removed by edits"))).to_be_visible()
-    assert scan_cloud(operator.session, "one").measured_count == len(valid) - selected
+    assert load_scan_cloud(operator.session, "one").measured_count == len(valid) - selected
 
     choose(page, "Select by", "rectangle")
     expect(page.get_by_text("Drag a rectangle")).to_be_visible()
@@ -249,10 +249,10 @@ def test_region_is_set_by_numbers_and_by_handle(wizard: tuple[Opened, App, Opera
     click(page, "Automatic region")
     wait_until(page, lambda: region() is not None)
     automatic = region()
-    assert scan_cloud(operator.session, "one").measured_count > 0.995 * total
+    assert load_scan_cloud(operator.session, "one").measured_count > 0.995 * total
     field(page, "Size (mm)").fill(f"{automatic.size_mm[0] / 2:.1f}")
     wait_until(page, lambda: abs(region().size_mm[0] - automatic.size_mm[0] / 2) < 0.1)
-    assert 0.2 * total < scan_cloud(operator.session, "one").measured_count < 0.9 * total
+    assert 0.2 * total < load_scan_cloud(operator.session, "one").measured_count < 0.9 * total
     expect(page.get_by_text(re.compile("removed by edits and region"))).to_be_visible()
     page.locator("xpath=//*[normalize-space(text())='Handles']/following::input[1]").check()
     for share in 10 * (0.3, 0.25, 0.35):  # of the box, along the arrow; what is drawn just then may take the drag
@@ -347,7 +347,7 @@ def test_plan_is_made_uploaded_and_run_on_two_scans(tmp_path: Path, browser: Bro
         opened = Opened(page)
         page.goto(app.server.link())
         click(page, "8. Measure")
-        views.wait_for(page, scan_cloud(operator.session, "a").points)
+        views.wait_for(page, load_scan_cloud(operator.session, "a").points)
         page.get_by_text("Sphere", exact=True).click()
         choose(page, "Region", "rectangle")
         wait_until_still(page)

@@ -3,16 +3,29 @@
 import posixpath
 import re
 from pathlib import Path
+from typing import get_args
 
 from slviewer import wizard
 from slviewer.calibration.diagnosis.verdict import CAUSES, Finding, Verdict
+from slviewer.fringe.phase import Reason as PixelReason
+from slviewer.fringe.suspect import Fault
 from slviewer.gui.calibration_html import verdict_html
-from slviewer.gui.help_links import FINDINGS, FINDINGS_PAGE, STAGES, STEPS_PAGE, help_link, step_help_link
+from slviewer.gui.help_links import FINDINGS_PAGE, STAGES, STEPS_PAGE, help_link, step_help_link
 from slviewer.gui.merge_html import merge_failure_html
 from slviewer.gui.rig_check import checks_table
 from slviewer.pipeline.check_results import CHECK_NAMES, Check, Preflight
+from slviewer.registration.refusal import Reason as Refusal
 from slviewer.server.help_pages import HelpPages, docs_folder
 from slviewer.wizard.steps import STEPS
+
+FINDINGS = {
+    *(f"frame-{fault}" for fault in get_args(Fault)),
+    *(f"pixel-{reason.name.lower()}" for reason in PixelReason if reason != PixelReason.VALID),
+    *(f"check-{name}" for name in CHECK_NAMES),
+    *CAUSES,
+    *(f"merge-{reason}" for reason in get_args(Refusal)),
+}
+"""Anchors of the findings, one section each."""
 
 
 def hrefs(html: str) -> list[str]:

@@ -7,9 +7,9 @@ import pytest
 from facts import missing_facts
 
 from slviewer.gui.measure_drawing import drawn, format_quantity, label, lifted
-from slviewer.gui.measure_html import deviation_figure, measurement_html, measurements_table, verdict_html
+from slviewer.gui.measure_html import deviation_figure, deviation_html, measurement_html, measurements_table
 from slviewer.gui.measure_section import cursor_html, cursor_points
-from slviewer.gui.measure_surface import painting
+from slviewer.gui.measure_surface import paint_surface
 from slviewer.gui.measure_tools import COMPARE, FIT, PICK, Tool
 from slviewer.inspection.features import Feature
 from slviewer.inspection.quantities import Quantity
@@ -115,7 +115,7 @@ def test_measurements_as_text() -> None:
     assert listed.index("point on scan_01, stale") < listed.index("sphere on scan_01")
     statistics = {"points": 900, "left_out": 100}
     verdict = {"tolerance_mm": 0.1, "decision": "undecided", "U_mm": 0.02, "inside": 90.0, "close": 9.0, "outside": 1.0}
-    told = text(verdict_html({"verdict": verdict, "statistics_mm": statistics, "reach_mm": 2.0}))
+    told = text(deviation_html({"verdict": verdict, "statistics_mm": statistics, "reach_mm": 2.0}))
     facts = (f"± 0.1 mm: {DECIDED['undecided']}", "90.00 %", "9.00 %", "1.00 %", "10.0 %", "2 mm")
     assert missing_facts(told, *facts) == []
     edges = np.linspace(-0.2, 0.2, 9)
@@ -128,9 +128,9 @@ def test_a_merge_is_painted_and_clicked_as_a_scan_is() -> None:
         points, np.full(5, 0.1, np.float32), "merge/1", "stereo", {}, texture=np.full((5, 3), 9, np.uint8)
     )
     assert place_at(merge, np.zeros(3), points[3]) == 3
-    drawn_points, painted, _ = painting(merge, "texture")
+    drawn_points, painted, _ = paint_surface(merge, "texture")
     assert drawn_points.shape == painted.shape == (5, 3) and painted.max() == 9
-    assert "normal" in text(painting(merge, "uncertainty")[2])
+    assert "normal" in text(paint_surface(merge, "uncertainty")[2])
     scan = MeasuredSurface(points[None], np.full((1, 5), 0.1, np.float32), "scan_01", "stereo", {})
     assert place_at(scan, np.zeros(3), points[3]) == (3, 0)
-    assert "depth" in painting(scan, "texture")[2]  # where there is no texture
+    assert "depth" in paint_surface(scan, "texture")[2]  # where there is no texture

@@ -36,7 +36,7 @@ from slviewer.gui.app import App
 from slviewer.gui.calibration_html import named_poses, verdict_html
 from slviewer.gui.inputs import display_name
 from slviewer.gui.pictures import Painter
-from slviewer.gui.steps.scan import painting, point_html, sort_scans, uncertainty
+from slviewer.gui.steps.scan import paint_cloud, point_html, sort_scans, uncertainty
 from slviewer.gui.steps.verify import shape_of
 from slviewer.gui.widgets import colour_range, records_html, report_table
 from slviewer.pipeline.calibration_verdict import save_verdict
@@ -470,13 +470,13 @@ def test_cloud_is_coloured_by_chosen_quantity() -> None:
     points[1:, 1:] = np.stack(np.broadcast_arrays(0.0, 1.0, np.linspace(500, 600, 4)), axis=-1)
     flat = np.ones((4, 5), np.float32)
     cloud = ScanCloud("a", "stereo", "x", points, flat, flat, flat, np.full((4, 5), 7, np.uint8), {})
-    painted, words = painting(cloud, "depth")
+    painted, words = paint_cloud(cloud, "depth")
     assert painted.shape == (4, 5, 3) and len(np.unique(painted[1], axis=0)) == 5 and "mm" in words
     noisy = replace(cloud, sigma_z=3 * flat, sigma_calibration=4 * flat)
     np.testing.assert_allclose(uncertainty(noisy)[1:, 1:], 5.0)
-    assert "5&#46;000" in painting(noisy, "uncertainty")[1] and "5&#46;000" in point_html(noisy, 4, 2)
-    assert "noise only" in painting(cloud, "uncertainty")[1].replace("&#32;", " ")
-    assert painting(cloud, "texture")[0][0, 0] == 7
-    assert "measure this capture" in painting(cloud, "error")[1].replace("&#32;", " ")
+    assert "5&#46;000" in paint_cloud(noisy, "uncertainty")[1] and "5&#46;000" in point_html(noisy, 4, 2)
+    assert "noise only" in paint_cloud(cloud, "uncertainty")[1].replace("&#32;", " ")
+    assert paint_cloud(cloud, "texture")[0][0, 0] == 7
+    assert "measure this capture" in paint_cloud(cloud, "error")[1].replace("&#32;", " ")
     assert "600&#46;000" in point_html(cloud, 4, 2)
     assert colour_range(np.array([np.nan])) == (0.0, 1.0)

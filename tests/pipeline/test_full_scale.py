@@ -32,7 +32,7 @@ from slviewer.session.importers.images import read_frames
 from slviewer.session.store import Session
 from slviewer.simulation.rig import letter
 from slviewer.wizard.preview_watcher import brightness, reduced
-from slviewer.wizard.result_views import thumbnail
+from slviewer.wizard.result_views import make_thumbnail
 from slviewer.wizard.snapshot import DIM
 
 DARK, BRIGHT = 0.04, 3.0
@@ -83,7 +83,7 @@ def test_a_dark_capture_is_dark_everywhere(tmp_path: Path) -> None:
         assert frames.dtype == np.uint16 and 100 < frames.max() < 200
         shown = capture_texture(shot, frames, stretch=False)
         assert 5 < shown.max() < 15 and capture_texture(shot, frames).max() == 255
-        assert cv2.imdecode(np.frombuffer(thumbnail(shot), np.uint8), 0).max() < 20
+        assert cv2.imdecode(np.frombuffer(make_thumbnail(shot), np.uint8), 0).max() < 20
         assert stated_full_scale(replay(frames, shot.sequence).camera) == 4095
     exposure = check_recorded_rig(folder, "a").check("exposure")
     assert exposure.verdict == "bad" and 0.03 < exposure.figures["bright_share_of_full_scale"] < 0.05

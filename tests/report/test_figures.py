@@ -72,7 +72,7 @@ def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
 @pytest.mark.parametrize("width", [FULL, 528])
 def test_error_maps_share_one_scale_centred_on_zero(drawn: list[Any], width: int) -> None:
     small, large = error_map(200, 0.05, 0.02, 1), error_map(200, 0.5, 0.02, 2)
-    figure = maps.error_maps("pose 3", {"stereo": large, "pixelwise": small}, RMS, 0.036, width=width)
+    figure = maps.draw_error_maps("pose 3", {"stereo": large, "pixelwise": small}, RMS, 0.036, width=width)
     assert opened(figure).shape[1] == DENSITY * width
     images = [image for axes in drawn[0].axes for image in axes.get_images()]
     limits = {image.get_clim() for image in images}
@@ -87,7 +87,7 @@ def test_maps_are_cropped_to_the_data_and_grey_where_there_is_none(drawn: list[A
     errors[140:150, 200:220] = np.nan
     other = errors.copy()
     other[:, 280:] = np.nan
-    image = opened(maps.error_maps("pose 3", {"stereo": errors, "pixelwise": other}, RMS))
+    image = opened(maps.draw_error_maps("pose 3", {"stereo": errors, "pixelwise": other}, RMS))
     shown = [image for axes in drawn[0].axes for image in axes.get_images()]
     assert {s.get_array().shape for s in shown} == {(104, 154)}
     assert shown[0].get_cmap().get_bad()[:3] == pytest.approx(np.array([0xD5, 0xD9, 0xDE]) / 255)
@@ -103,7 +103,7 @@ def test_one_limit_for_many_figures() -> None:
 @pytest.mark.slow
 def test_nothing_measured_is_drawn_as_nothing() -> None:
     empty = np.full((60, 80), np.nan, np.float32)
-    opened(maps.error_maps("pose", {"stereo": empty}, {"stereo": float("nan")}))
+    opened(maps.draw_error_maps("pose", {"stereo": empty}, {"stereo": float("nan")}))
     opened(maps.rms_maps(np.full((3, 60, 80), np.nan)))
     opened(draw_clouds([CloudView("nothing", np.full((60, 80, 3), np.nan, np.float32))]))
     opened(draw_merged_cloud(CloudView("nothing", np.zeros((0, 3), np.float32))))
@@ -157,8 +157,8 @@ def test_clouds_are_counted() -> None:
 @pytest.mark.parametrize(
     "draw",
     [
-        lambda: maps.error_maps("t", {}, {}),
-        lambda: maps.error_maps("t", {"a": np.zeros((2, 3)), "b": np.zeros((3, 2))}, RMS),
+        lambda: maps.draw_error_maps("t", {}, {}),
+        lambda: maps.draw_error_maps("t", {"a": np.zeros((2, 3)), "b": np.zeros((3, 2))}, RMS),
         lambda: maps.rms_maps(rms_maps(40)[:2]),
         lambda: planes_in_space({}, (500, 700)),
         lambda: planes_in_space({"p": np.zeros((2, 3))}, (500, 700)),

@@ -129,7 +129,7 @@ def test_poses_are_asked_for_until_the_wanted_sigma_is_reached(operator: Operato
 def test_panels_find_what_they_draw(operator: Operator) -> None:
     store = operator.session
     assert store is not None
-    cloud = result_views.scan_cloud(store, "plane_01")
+    cloud = result_views.load_scan_cloud(store, "plane_01")
     assert cloud.points.shape == (300, 400, 3) and set(cloud.errors) == {"stereo", "pixelwise", "splined"}
     measured = np.isfinite(cloud.points).all(-1)
     assert np.isfinite(cloud.phase[measured]).all() and cloud.modulation[measured].min() > 1
@@ -230,7 +230,7 @@ def read_head(path: Path) -> str:
 def test_a_scale_that_was_applied_is_in_the_clouds_and_makes_older_ones_stale(operator: Operator) -> None:
     store = operator.session
     assert store is not None
-    before = result_views.scan_cloud(store, "scan_02").points
+    before = result_views.load_scan_cloud(store, "scan_02").points
     inputs = store.input_hashes("calibration/splined")
     store.save_result("scale/splined", {"factor": 1.001, "certificate": "lab 7", "inputs": inputs}, {})
     assert operator.choose_model("splined")
@@ -244,7 +244,7 @@ def test_a_scale_that_was_applied_is_in_the_clouds_and_makes_older_ones_stale(op
     assert operator.reconstruct("scan_02")
     scan = operator.wait_until_idle(HANG_S).scan("scan_02")
     assert scan is not None and scan.cloud == "fresh" and missing_facts(scan.figures.scale, "+1000 ppm", "lab 7") == []
-    after = result_views.scan_cloud(store, "scan_02").points
+    after = result_views.load_scan_cloud(store, "scan_02").points
     both = np.isfinite(before[..., 2]) & np.isfinite(after[..., 2])
     np.testing.assert_allclose(after[both], before[both] * np.float32(1.001), rtol=1e-6)
     store.trash_result("scale/splined")

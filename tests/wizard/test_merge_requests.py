@@ -122,7 +122,7 @@ def test_a_turntable_is_told_by_its_angle_and_a_wrong_one_is_refused_until_the_n
 def test_picked_pairs_start_a_merge(operator: Operator) -> None:
     assert operator.reconstruct("third") and operator.session is not None
     operator.wait_until_idle(HANG_S)
-    cloud = result_views.scan_cloud(operator.session, "third")
+    cloud = result_views.load_scan_cloud(operator.session, "third")
     v, u = np.nonzero(np.isfinite(cloud.points[..., 2]))
     chosen = [int(np.argmin(u)), int(np.argmax(u)), int(np.argmin(v)), int(np.argmax(v))]
     there = cloud.points[v[chosen], u[chosen]].astype(float)

@@ -67,7 +67,7 @@ def test_an_image_is_searched_again_only_once_something_has_moved(monkeypatch: p
         searched.append(image)
         return None, "no board"
 
-    monkeypatch.setattr(preview_watcher, "detect_board", detect_nothing)
+    monkeypatch.setattr(preview_watcher, "detect_in_preview", detect_nothing)
     rig = letter(0.25, local_distortion_px=0)
     white = PatternSequence(rig.projector.size, (Frame("white"),))
     watcher = Watcher(lambda view: None)

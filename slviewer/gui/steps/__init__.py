@@ -1,1 +1,1 @@
-"""One file for each step of the wizard, named by the step's key: each holds a `Panel`."""
+"""One file for each step of the wizard, named by the step's key: each holds its panel, such as `RigPanel`."""

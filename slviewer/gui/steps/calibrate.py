@@ -13,7 +13,7 @@ from slviewer.gui.calibration_html import (
     splined_html,
     verdict_html,
 )
-from slviewer.gui.inputs import Choice, SessionValue, change, display_name
+from slviewer.gui.inputs import Choice, SessionValue, change, scan_options
 from slviewer.gui.panel import PanelContext, StepPanel
 from slviewer.gui.pictures import PLOT_PX, Plot
 from slviewer.gui.widgets import Html, Text, coloured, paint, paragraph, report_table, table, to_html
@@ -35,7 +35,7 @@ USUAL_WEIGHT = "80 % or more is usual"
 _MOST_NAMED = 6  # poses of a verdict that are offered as buttons: they fit on two lines
 
 
-class Panel(StepPanel):
+class CalibratePanel(StepPanel):
     """Panel of the step Calibrate."""
 
     key = "calibrate"
@@ -45,7 +45,6 @@ class Panel(StepPanel):
         super().__init__(context)
         self._pixel_chosen = False
         self._boards: tuple[Any, ...] = ()
-        self._cloud: result_views.ScanCloud | None = None
         self._details: tuple[tuple[Any, ...], CalibrationFigures] | None = None
         self._chosen = ""  # the operator's model in the latest snapshot
 
@@ -104,24 +103,18 @@ class Panel(StepPanel):
             session, calibration, busy = snapshot.session, snapshot.calibration, snapshot.is_busy
             label = "Calibrate again" if calibration else "Calibrate"
             change(self._calibrate, disabled=busy or snapshot.step(self.key).state == "blocked", label=label)
-            shown = calibration is not None
             self._draw_verdict(session, calibration)
             self._draw_models(calibration, busy)
-            for folder, visible in (
-                (self._poses_folder, shown and bool(calibration and calibration.stereo.poses)),
-                (self._parameters_folder, shown),
-                (self._pixels_folder, shown and bool(calibration and calibration.fit_rms_mm)),
-            ):
-                change(folder, visible=visible)
+            change(self._poses_folder, visible=bool(calibration and calibration.stereo.poses))
+            change(self._parameters_folder, visible=calibration is not None)
+            change(self._pixels_folder, visible=bool(calibration and calibration.fit_rms_mm))
             self._summary.set(_summary(calibration) if calibration else "")
             if session is None or calibration is None:
                 return
             names = [pose.name for pose in session.poses if pose.state in ("used", "excluded", "unused")]
             self._pose.offer([(name, name) for name in names], worst(calibration))
             self._axis.offer([(axis, axis) for axis in calibration.fit_rms_mm])
-            clouds = [
-                (scan.name, display_name(scan.name, scan.label)) for scan in session.scans if scan.cloud != "absent"
-            ]
+            clouds = scan_options(scan for scan in session.scans if scan.cloud != "absent")
             self._over.offer([("", "none"), *clouds])
             self._fits.set(_fits(calibration))
             if not self._pixel_chosen:
@@ -180,7 +173,7 @@ class Panel(StepPanel):
     def _refresh(self) -> None:
         """Request the pictures of the chosen pose, axis and pixel."""
         with self._lock:
-            session = self._snapshot.session if self._snapshot else None
+            session = self._session
             if session is None or session.calibration is None:
                 return
             calibration, context = session.calibration, self._context
@@ -341,15 +334,16 @@ class Panel(StepPanel):
             return
         self._refresh()
         context = self._context
-        self._painter.request("cloud", name, lambda: result_views.scan_cloud(context.session, name), self._draw_cloud)
+        self._painter.request(
+            "cloud", name, lambda: result_views.load_scan_cloud(context.session, name), self._draw_cloud
+        )
 
     def _draw_cloud(self, cloud: result_views.ScanCloud) -> None:
         """Draw a cloud, coloured by depth, to choose pixels on."""
         self._cloud = cloud
         self._scene.cloud(LAYER, "cloud", cloud.points, paint(cloud.points[..., 2], "mm", 1, "")[0])
         self._scene.show(LAYER, self._visible)
-        if self._visible:
-            self._context.viewpoints.show(f"{LAYER} {cloud.name}", cloud.points)
+        self._show_view()
 
     def _pick_pixel(self, origin: np.ndarray, direction: np.ndarray) -> None:
         """Choose the pixel whose point is closest to the clicked ray."""

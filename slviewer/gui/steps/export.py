@@ -8,7 +8,7 @@ import numpy as np
 import viser
 
 from slviewer.errors import SlviewerError
-from slviewer.gui.inputs import Choice, change, display_name
+from slviewer.gui.inputs import Choice, change, scan_options
 from slviewer.gui.panel import PanelContext, StepPanel
 from slviewer.gui.widgets import Html, Text, coloured, link, paragraph, records_html, table, to_html
 from slviewer.pipeline.export import (
@@ -31,6 +31,7 @@ LIST_PX = 250
 """Height of the list of files, so that the inputs below stay in view."""
 MERGED = "merged"
 POINTS, MESH = "points", "mesh"
+MESHES = ("mesh", "merged-mesh")
 FORMAT_NAMES = {
     "ply": "PLY",
     "stl": "STL",
@@ -107,7 +108,7 @@ class MeshInputs:
         return MeshingPlan(method, sizes.get(holes), self.triangles, SMOOTHING[self._smooth.value], holes == CLOSED)
 
 
-class Panel(StepPanel):
+class ExportPanel(StepPanel):
     """Panel of the step Export."""
 
     key = "export"
@@ -169,24 +170,23 @@ class Panel(StepPanel):
     def draw(self, snapshot: Snapshot) -> None:
         """Show what a snapshot's session can export, and its files."""
         self._snapshot = snapshot
-        session = snapshot.session
-        busy = snapshot.is_busy
-        ready = session is not None and snapshot.step(self.key).state != "blocked"
+        session, calibration = snapshot.session, snapshot.calibration
         self._files.set(self._files_html(session))
         if session is None:
             return
         things = [(MERGED, "merged scans")] if session.merge else []
-        things += [(scan.name, display_name(scan.name, scan.label)) for scan in session.scans if scan.cloud != "absent"]
+        things += scan_options(scan for scan in session.scans if scan.cloud != "absent")
         self._source.offer(things)
-        models = session.calibration.models if session.calibration else ()
+        models = calibration.models if calibration else ()
         coefficients = bool({"pixelwise", "splined"} & set(models))
         self._numbers.offer([(k, text) for k, (text, _) in NUMBERS.items() if k != "coefficients" or coefficients])
-        refused = session.calibration is not None and bool(session.calibration.refused)
-        change(self._report, disabled=busy or not ready)
-        change(self._write_numbers, disabled=busy or not ready or refused)
+        unusable = snapshot.is_busy or (calibration is not None and bool(calibration.refused))
+        blocked = snapshot.step(self.key).state == "blocked"
+        change(self._report, disabled=snapshot.is_busy or blocked)
+        change(self._write_numbers, disabled=unusable or blocked)
         for button in (self._write, self._finish):
-            change(button, disabled=busy or not things or refused)
-        change(self._table, disabled=busy or not session.records)
+            change(button, disabled=unusable or not things)
+        change(self._table, disabled=snapshot.is_busy or not session.records)
         change(self._figures_folder, visible=bool(session.records))
         labels = {scan.name: scan.label for scan in session.scans}
         self._figures.set("".join(records_html(session.list_records(kind), labels) for kind in RECORDS.values()))
@@ -199,42 +199,46 @@ class Panel(StepPanel):
 
     def _get_shape(self) -> tuple[What, str]:
         """Return what is to be exported, and its name; empty where nothing is offered."""
-        name, mesh, session = self._source.value, self._as.value == MESH, self._snapshot and self._snapshot.session
+        name, mesh, session = self._source.value, self._as.value == MESH, self._session
         if name == MERGED:
             return "merged-mesh" if mesh else "merge", session.merge.name if session and session.merge else ""
         return "mesh" if mesh else "cloud", name
 
     def _describe(self) -> None:
         """Describe the chosen files, link those that exist, and request the cloud."""
-        session = self._snapshot.session if self._snapshot else None
-        if session is None:
-            return
-        self._request_cloud(session)
+        if self._session is not None:
+            self._request_cloud(self._session)
+            self._describe_shape(self._session)
+            self._describe_numbers(self._session)
+
+    def _describe_shape(self, session: SessionView) -> None:
+        """Describe the file of the chosen cloud or mesh, and link it where it exists."""
         what, name = self._get_shape()
-        mesh = what in ("mesh", "merged-mesh")
+        mesh = what in MESHES
         self._mesh.draw(mesh and bool(name), what == "merged-mesh")
         self._shape_format.offer([(each, FORMAT_NAMES.get(each, each.upper())) for each in formats(what)])
         change(self._texture, visible=bool(name) and mesh and self._shape_format.value in TEXTURED_FORMATS)
         change(self._white, visible=self._texture.visible and TEXTURES[self._texture.value] is not None)
-        if name:
-            chosen = self._shape_format.value
-            file = _get_export(session, default_file_name(what, name, chosen))
-            predicted = estimate_file_bytes(
-                what, chosen, *_points(session, name), self._mesh.triangles if mesh else None
-            )
-            shown_type: What = "merged-mesh" if mesh and self._mesh.plan().method != "grid" else what
-            self._shape_note.write(
-                describe_shape_file(session, shown_type, name, chosen, None if file else predicted), "dim"
-            )
-            self._shape_link.set(self._link_html(file))
-            self._shape_result.write(self._result_text(file) if file and mesh else "", "dim")
-            is_own = file is not None and what == "merge" and chosen == "ply"  # the merge's own file
-            label = "Write again" if file else "Write file"
-            change(self._write, visible=not is_own, label=label, color=_button_colour(file))
-        else:
+        if not name:
             self._shape_note.write("Nothing reconstructed yet: scan an object first.", "warning")
             self._shape_link.set("")
-            self._shape_result.write("")
+            self._shape_result.set("")
+            return
+        chosen = self._shape_format.value
+        file = _get_export(session, default_file_name(what, name, chosen))
+        predicted = estimate_file_bytes(what, chosen, *_points(session, name), self._mesh.triangles if mesh else None)
+        shown_type: What = "merged-mesh" if mesh and self._mesh.plan().method != "grid" else what
+        self._shape_note.write(
+            describe_shape_file(session, shown_type, name, chosen, None if file else predicted), "dim"
+        )
+        self._shape_link.set(self._link_html(file))
+        self._shape_result.write(self._result_text(file) if file and mesh else "", "dim")
+        is_own = file is not None and what == "merge" and chosen == "ply"  # the merge's own file
+        label = "Write again" if file else "Write file"
+        change(self._write, visible=not is_own, label=label, color=_button_colour(file))
+
+    def _describe_numbers(self, session: SessionView) -> None:
+        """Describe the file of the chosen numbers, and link it where it exists."""
         numbers: What = self._numbers.value or "calibration"  # type: ignore[assignment]
         self._number_format.offer([(each, FORMAT_NAMES[each]) for each in formats(numbers)])
         chosen = self._number_format.value
@@ -261,7 +265,7 @@ class Panel(StepPanel):
             if name == MERGED:
                 whole = result_views.merged_cloud(context.session, merge)
                 return whole.points, whole.colours
-            cloud = result_views.scan_cloud(context.session, name)
+            cloud = result_views.load_scan_cloud(context.session, name)
             return cloud.points, cloud.texture
 
         key: Any = merge if name == MERGED else clouds.get(name)
@@ -286,7 +290,7 @@ class Panel(StepPanel):
         """Request the file of the chosen cloud or mesh."""
         what, name = self._get_shape()
         if name:
-            plan = self._mesh.plan() if what in ("mesh", "merged-mesh") else None
+            plan = self._mesh.plan() if what in MESHES else None
             chosen = self._shape_format.value
             texture = TEXTURES[self._texture.value] if plan is not None and chosen in TEXTURED_FORMATS else None
             white = BOARD if texture is not None and self._white.value else ""

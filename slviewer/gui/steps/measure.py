@@ -33,7 +33,7 @@ _PICKED = ("picked 1", "picked 2")
 _MEASURES: dict[str, Any] = {"Point": add_point, "Distance": add_distance, "Section": add_section}
 
 
-class Panel(StepPanel):
+class MeasurePanel(StepPanel):
     """Panel of the step Measure."""
 
     key = "measure"

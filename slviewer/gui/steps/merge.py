@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import viser
 
-from slviewer.gui.inputs import Choice, change, display_name
+from slviewer.gui.inputs import Choice, change, display_name, scan_options
 from slviewer.gui.merge_html import merge_failure_html, merge_html, turntable_html
 from slviewer.gui.merge_picking import PointPicker
 from slviewer.gui.merge_views import AFTER, BEFORE, MERGED, SHOWN, ColouredClouds, colour_merge, colour_scans
@@ -14,6 +14,7 @@ from slviewer.gui.panel import PanelContext, StepPanel
 from slviewer.gui.point_editing import PointEditing
 from slviewer.gui.steps.verify import shape_of
 from slviewer.gui.widgets import Text
+from slviewer.pipeline.merge import StartKind
 from slviewer.pipeline.stored_records import Stored
 from slviewer.records.merge import Merge
 from slviewer.wizard.snapshot import ScanView, SessionView, Snapshot
@@ -21,15 +22,24 @@ from slviewer.wizard.snapshot import ScanView, SessionView, Snapshot
 LAYER, EDITS = "merge", "merge edits"
 FEATURES, MARKERS, PLACED, TURNTABLE = "features", "markers", "places while scanning", "turntable"
 CURRENT, PICKED = "current position", "picked points"
-STARTS = (FEATURES, MARKERS, PLACED, TURNTABLE, CURRENT, PICKED)
+STARTS: dict[str, StartKind] = {
+    FEATURES: "features",
+    MARKERS: "markers",
+    PLACED: "placed",
+    TURNTABLE: "turntable",
+    CURRENT: "identity",
+    PICKED: "features",
+}
+"""Initial alignments by what they are called here; picked points take the place of features."""
 SIDE_BY_SIDE = "side by side, to pick"
-_MARKERS_NOTE = (
-    "For coded markers on or beside the object, three or more in common: slviewer target markers:0-23:20 draws them."
-)
-_CURRENT_NOTE = "For scans between which neither the object nor the camera moved, or hardly."
+_START_NOTES = {
+    MARKERS: "For coded markers on or beside the object, three or more in common: slviewer target markers:0-23:20 "
+    "draws them.",
+    CURRENT: "For scans between which neither the object nor the camera moved, or hardly.",
+}
 
 
-class Panel(StepPanel):
+class MergePanel(StepPanel):
     """Panel of the step Merge."""
 
     key = "merge"
@@ -51,7 +61,9 @@ class Panel(StepPanel):
         with gui.add_folder("Alignment", visible=False) as self._alignment_folder:
             self._reference = Choice(gui, "Reference", "The other scans are moved to it")
             self._reference.on_change(context.callback(self._refresh))
-            self._start: Any = gui.add_dropdown("Start from", STARTS, hint="Initial alignment, which is then refined")
+            self._start: Any = gui.add_dropdown(
+                "Start from", tuple(STARTS), hint="Initial alignment, which is then refined"
+            )
             self._start.on_update(context.callback(self._change_start))
             self._start.on_update(context.callback(self._keep_start, by_user=True))
             self._angle: Any = gui.add_number(
@@ -77,11 +89,11 @@ class Panel(StepPanel):
         with self._lock:
             self._snapshot = snapshot
             session = snapshot.session
-            scans = _list_mergeable(session) if session else []
+            scans = _list_mergeable(session)
             self._draw_boxes(scans)
             merge = session.merge if session else None
             preferred = merge.record.reference if merge else scans[-1].name if scans else ""
-            self._reference.offer([(scan.name, display_name(scan.name, scan.label)) for scan in scans], preferred)
+            self._reference.offer(scan_options(scans), preferred)
             change(self._alignment_folder, visible=len(scans) > 1)
             change(self._undo, visible=merge is not None)
             labels = {scan.name: scan.label for scan in scans}
@@ -140,7 +152,7 @@ class Panel(StepPanel):
         if not chosen:
             return
         turned = self._get_stored_angles([scan.name for scan in chosen]) is not None
-        placed = all(scan.placement is not None and scan.placement.T_first_scan is not None for scan in chosen)
+        placed = all(scan.is_placed for scan in chosen)
         start = TURNTABLE if turned else PLACED if placed else FEATURES
         if self._start.value != start:
             self._start.value = start
@@ -148,21 +160,20 @@ class Panel(StepPanel):
     def _change_start(self) -> None:
         """Update the views for another initial alignment; picked points are shown side by side."""
         with self._lock:
-            self._offer_views(self._snapshot.session.merge if self._snapshot and self._snapshot.session else None)
+            self._offer_views(self._session.merge if self._session else None)
             if self._start.value == PICKED:
                 self._view.choose(SIDE_BY_SIDE)
             self._refresh()
 
     def _list_chosen(self) -> list[str]:
         """List the scans to merge, with the reference, in the order of their capture."""
-        scans = _list_mergeable(self._snapshot.session) if self._snapshot and self._snapshot.session else []
+        scans = _list_mergeable(self._session)
         boxes, reference = self._boxes, self._reference.value
         return [s.name for s in scans if s.name == reference or (s.name in boxes and boxes[s.name].value)]
 
     def _get_stored_angles(self, names: list[str]) -> list[float] | None:
         """Return the angles, deg, that are stored with scans of one turn; None where they are of several or of none."""
-        session = self._snapshot.session if self._snapshot else None
-        scans = {scan.name: scan for scan in session.scans} if session else {}
+        scans = {scan.name: scan for scan in self._session.scans} if self._session else {}
         steps = [step for name in names if (step := scans[name].turn_step) is not None]
         same = len(steps) == len(names) and len({step.turn for step in steps}) == 1
         return [step.deg for step in steps] if same else None
@@ -181,8 +192,7 @@ class Panel(StepPanel):
     def _refresh(self) -> None:
         """Update inputs and notes for the current choice, and request the clouds."""
         with self._lock:
-            snapshot = self._snapshot
-            session = snapshot.session if snapshot else None
+            snapshot, session = self._snapshot, self._session
             if snapshot is None or session is None:
                 return
             names, start = self._list_chosen(), self._start.value
@@ -192,13 +202,7 @@ class Panel(StepPanel):
                 if scan.cloud != "absent"
             }
             labels = {scan.name: scan.label for scan in session.scans}
-            stored = self._get_stored_angles(names)
-            change(self._angle, visible=start == TURNTABLE and stored is None)
-            if start == TURNTABLE:
-                given = [k * float(self._angle.value) for k in range(len(names))]
-                self._start_note.set(turntable_html(names, given if stored is None else stored, labels))
-            else:
-                self._start_note.write({CURRENT: _CURRENT_NOTE, MARKERS: _MARKERS_NOTE}.get(start, ""), "dim")
+            self._draw_start(names, labels)
             chosen = {name: versions[name] for name in names}
             self._picker.offer(chosen, self._reference.value, labels, start == PICKED)
             ready = len(names) > 1 and (start != PICKED or self._picker.is_ready)
@@ -209,6 +213,16 @@ class Panel(StepPanel):
             self._show_layers()
             if not self._is_picking:
                 self._request_clouds(session, names, versions, labels)
+
+    def _draw_start(self, names: list[str], labels: dict[str, str]) -> None:
+        """Show the angles or the note of the chosen initial alignment."""
+        start, stored = self._start.value, self._get_stored_angles(names)
+        change(self._angle, visible=start == TURNTABLE and stored is None)
+        if start == TURNTABLE:
+            given = [k * float(self._angle.value) for k in range(len(names))]
+            self._start_note.set(turntable_html(names, given if stored is None else stored, labels))
+        else:
+            self._start_note.write(_START_NOTES.get(start, ""), "dim")
 
     def _request_clouds(
         self, session: SessionView, names: list[str], versions: Mapping[str, Any], labels: dict[str, str]
@@ -278,27 +292,18 @@ class Panel(StepPanel):
 
     def _request_merge(self) -> None:
         """Request the merge of the chosen scans by the chosen initial alignment."""
-        merge, start, reference, names = (
-            self._operator.merge,
-            self._start.value,
+        start, names = self._start.value, self._list_chosen()
+        needs_angle = start == TURNTABLE and self._get_stored_angles(names) is None
+        self._operator.merge(
+            names,
             self._reference.value,
-            self._list_chosen(),
+            start=STARTS[start],
+            angle=float(self._angle.value) if needs_angle else None,
+            picked=self._picker.picked() if start == PICKED else None,
         )
-        if start == TURNTABLE:
-            stored = self._get_stored_angles(names) is not None
-            merge(names, reference, start="turntable", angle=None if stored else float(self._angle.value))
-        elif start == PLACED:
-            merge(names, reference, start="placed")
-        elif start == MARKERS:
-            merge(names, reference, start="markers")
-        elif start == CURRENT:
-            merge(names, reference, start="identity")
-        elif start == PICKED:
-            merge(names, reference, picked=self._picker.picked())
-        else:
-            merge(names, reference)
 
 
-def _list_mergeable(session: SessionView) -> list[ScanView]:
+def _list_mergeable(session: SessionView | None) -> list[ScanView]:
     """List the reconstructed scans of objects, without captured planes and spheres."""
-    return [scan for scan in session.scans if scan.cloud != "absent" and shape_of(scan) == "scan"]
+    scans = session.scans if session else ()
+    return [scan for scan in scans if scan.cloud != "absent" and shape_of(scan) == "scan"]

@@ -67,7 +67,7 @@ def _draw_field(count: int, width: int, height: int, mark: str = "") -> str:
     return f'<div style="{style};line-height:{height}px;text-align:center">{mark}</div>'
 
 
-class Panel(StepPanel):
+class PosesPanel(StepPanel):
     """Panel of the step Poses."""
 
     key = "poses"
@@ -77,7 +77,7 @@ class Panel(StepPanel):
         super().__init__(context)
         self._board: Board | None = None
         self._states: dict[str, str] = {}
-        self._session: Any = None
+        self._drawn_session: Any = None
         self._is_counting = False
         self._dragged = self._sent = 0.0
         self._ghost_px: np.ndarray | None = None
@@ -137,9 +137,9 @@ class Panel(StepPanel):
         self._hands_free_value.update(snapshot.hands_free)
         self._draw_world(snapshot)
         self._import.draw(snapshot)
-        if session is self._session:
+        if session is self._drawn_session:
             return
-        self._session = session
+        self._drawn_session = session
         poses = session.poses if session else ()
         self._coverage.set(coverage_chart(session.coverage) if session and session.coverage else "")
         self._draw_accuracy(session)
@@ -175,7 +175,7 @@ class Panel(StepPanel):
         """Show or hide the layers; the hotkey works only while shown."""
         super().show(visible)
         self._hotkey.disabled = not visible
-        self._session = None
+        self._drawn_session = None
 
     # drawing
 

@@ -16,7 +16,7 @@ _THIRD_OF_A_STOP = 2 ** (1 / 3)
 _SETTLES_S = 1.5  # an exposure that is being dragged is not set back to what the camera reported a moment ago
 
 
-class Panel(StepPanel):
+class RigPanel(StepPanel):
     """Panel of the step Rig."""
 
     key = "rig"

@@ -10,7 +10,7 @@ from slviewer.errors import InputError
 from slviewer.fringe.presets import PRESETS
 from slviewer.gui.exposures import ExposureInputs
 from slviewer.gui.import_inputs import ImportInputs
-from slviewer.gui.inputs import Choice, RestoreButton, SessionValue, change, display_name
+from slviewer.gui.inputs import Choice, RestoreButton, SessionValue, change, display_name, scan_options
 from slviewer.gui.live import LAYER as LIVE
 from slviewer.gui.live import LiveScreen
 from slviewer.gui.panel import PanelContext, StepPanel
@@ -39,7 +39,7 @@ from slviewer.records.verification import Verification
 from slviewer.report.maps import error_limit
 from slviewer.simulation.concave import CONCAVE
 from slviewer.wizard.result_views import AlignedScans, ScanCloud, aligned_scans, used_points, whole_cloud
-from slviewer.wizard.snapshot import LiveView, PreviewView, ScanView, Snapshot
+from slviewer.wizard.snapshot import LiveView, PreviewView, ScanView, SessionView, Snapshot
 
 LAYER = "scan"
 SMALL_PX = 380
@@ -51,7 +51,7 @@ LIVE_HINT = "Continuous clouds of 11 frames each: faster and noisier than a capt
 _STATES = {"absent": "not reconstructed", "fresh": "", "stale": "older calibration"}
 
 
-class Panel(StepPanel):
+class ScanPanel(StepPanel):
     """Panel of the step Scan."""
 
     key = "scan"
@@ -61,7 +61,6 @@ class Panel(StepPanel):
         super().__init__(context)
         self._known: tuple[str, ...] = ()
         self._placed: tuple[str, ...] | None = None
-        self._cloud: ScanCloud | None = None
         self._loaded: tuple[Any, ScanCloud] | None = None
         self._whole: ScanCloud | None = None
         self._redraws = 0
@@ -145,35 +144,19 @@ class Panel(StepPanel):
         """Show the scans and the live scan of a snapshot."""
         with self._lock:
             self._snapshot = snapshot
-            session, rig = snapshot.session, snapshot.rig
-            ready = snapshot.step(self.key).state != "blocked" and rig.state == "open" and rig.capture is None
-            change(self._capture_folder, visible=rig.state != "none")
-            change(self._capture, disabled=not ready)
-            self._draw_live(snapshot.live, ready)
-            change(self._patterns, disabled=rig.state != "open" or rig.capture is not None)
-            if session is not None:
-                self._patterns_value.update(session.patterns)
-            self._exposures.draw(snapshot)
-            self._turn.draw(snapshot, ready)
-            self._simulated.draw(snapshot)
-            self._import.draw(snapshot)
+            session = snapshot.session
+            self._draw_capture(snapshot)
             self._restore.offer(session.deleted_scans if session else ())
             self._align_value.update(bool(session and session.aligns_scans))
             scans = sort_scans(session.scans) if session else []
             self._offer_views(scans)
             change(self._cloud_folder, visible=bool(scans))
             self._gallery.set(gallery(scans, self._scan.value))
-            if session is None or not scans:
+            if not scans:
                 self._clear_cloud()
                 return
-            reconstructed = [scan.name for scan in scans if scan.cloud != "absent"]
-            names = [(scan.name, display_name(scan.name, scan.label)) for scan in scans]
-            self._scan.offer(names, (reconstructed or [""])[0])
-            if new := [name for name in reconstructed if name not in self._known]:
-                if self._known:  # show what was just reconstructed
-                    self._scan.choose(new[0])
-                self._known = tuple(reconstructed)
-            calibration = session.calibration
+            self._offer_scans(scans)
+            calibration = snapshot.calibration
             models = [(model, model) for model in calibration.models] if calibration else []
             self._model.offer(models, calibration.best if calibration else "")
             self._refresh()
@@ -191,6 +174,30 @@ class Panel(StepPanel):
         self._show_view()
 
     # drawing
+
+    def _draw_capture(self, snapshot: Snapshot) -> None:
+        """Update the inputs of capture, live scan and import."""
+        rig = snapshot.rig
+        ready = rig.is_idle and snapshot.step(self.key).state != "blocked"
+        change(self._capture_folder, visible=rig.state != "none")
+        change(self._capture, disabled=not ready)
+        self._draw_live(snapshot.live, ready)
+        change(self._patterns, disabled=not rig.is_idle)
+        if snapshot.session is not None:
+            self._patterns_value.update(snapshot.session.patterns)
+        self._exposures.draw(snapshot)
+        self._turn.draw(snapshot, ready)
+        self._simulated.draw(snapshot)
+        self._import.draw(snapshot)
+
+    def _offer_scans(self, scans: Sequence[ScanView]) -> None:
+        """Offer the scans, and choose one that was just reconstructed."""
+        reconstructed = [scan.name for scan in scans if scan.cloud != "absent"]
+        self._scan.offer(scan_options(scans), (reconstructed or [""])[0])
+        if new := [name for name in reconstructed if name not in self._known]:
+            if self._known:
+                self._scan.choose(new[0])
+            self._known = tuple(reconstructed)
 
     def _draw_live(self, live: LiveView | None, ready: bool) -> None:
         """Update buttons and figures of the live scan, during which a captured cloud is hidden."""
@@ -226,61 +233,62 @@ class Panel(StepPanel):
     def _refresh(self) -> None:
         """Request the chosen cloud in the chosen colours."""
         with self._lock:
-            scan = self._snapshot.scan(self._scan.value) if self._snapshot else None
-            if scan is None or self._snapshot is None:
+            snapshot, session = self._snapshot, self._session
+            scan = snapshot.scan(self._scan.value) if snapshot else None
+            if snapshot is None or session is None or scan is None:
                 return
-            session = self._snapshot.session
-            label = "Reconstruct" if scan.cloud == "absent" else "Reconstruct again"
-            change(self._reconstruct, disabled=self._snapshot.is_busy, label=label)
+            is_absent, busy = scan.cloud == "absent", snapshot.is_busy
+            change(self._reconstruct, disabled=busy, label="Reconstruct" if is_absent else "Reconstruct again")
             self._figures.set(scan_html(scan))
-            self._region.draw(session, scan.name if scan.cloud != "absent" else "")
+            self._region.draw(session, "" if is_absent else scan.name)
             self._editing.draw([scan])
-            self._draw_placement(scan, self._snapshot.is_busy)
+            self._draw_placement(scan, busy)
             shown = len(self._shown_scans())
             label = "Remove support" if shown == 1 else f"Remove support, {shown} scans"
-            usable = scan.cloud != "absent" and shape_of(scan) == "scan"
-            change(self._support, label=label, disabled=self._snapshot.is_busy or not usable)
-            self._gallery.set(gallery(sort_scans(session.scans) if session else (), scan.name))
+            change(self._support, label=label, disabled=busy or is_absent or shape_of(scan) != "scan")
+            self._gallery.set(gallery(sort_scans(session.scans), scan.name))
             if self._is_live:
                 return
-            if session is not None and self._view.value == ALIGNED:
-                placed = tuple((each.name, each.figures.model) for each in session.scans if is_placed(each))
+            if self._view.value == ALIGNED:
+                placed = tuple((each.name, each.figures.model) for each in session.scans if each.is_placed)
                 self._painter.request(
                     "cloud", (ALIGNED, placed), lambda: aligned_scans(self._context.session), self._draw_aligned
                 )
-                return
-            if scan.cloud == "absent":
+            elif is_absent:
                 self._clear_cloud()
-                return
-            views = session.list_records(Verification) if session else ()
-            verified = tuple(view.record.summary() for view in views if view.name == scan.name)
-            key = (scan.name, scan.figures.model, scan.figures.points, scan.figures.noise_mm, verified)
-            colour = self._colour.value
+            else:
+                self._request_cloud(session, scan)
 
-            def make() -> tuple[ScanCloud, ScanCloud, str, str]:
-                """Load the cloud, unless it is loaded already; returns it, what is used of it, the chosen colours, and
-                why nothing is used."""
-                if self._loaded is None or self._loaded[0] != key:
-                    self._loaded = key, whole_cloud(self._context.session, scan.name)
-                whole = self._loaded[1]
-                try:
-                    return whole, used_points(self._context.session, whole), colour, ""
-                except InputError as error:  # all is shown, so that the region can be put around it
-                    return whole, whole, colour, str(error)
+    def _request_cloud(self, session: SessionView, scan: ScanView) -> None:
+        """Request the cloud of a reconstructed scan in the chosen colours."""
+        views = session.list_records(Verification)
+        verified = tuple(view.record.summary() for view in views if view.name == scan.name)
+        key = (scan.name, scan.figures.model, scan.figures.points, scan.figures.noise_mm, verified)
+        colour = self._colour.value
 
-            used = session.restriction(scan.name) if session else None
-            self._painter.request("cloud", (key, used, self._redraws, colour), make, self._draw_cloud)
+        def make() -> tuple[ScanCloud, ScanCloud, str, str]:
+            """Load the cloud, unless it is loaded already; returns it, what is used of it, the chosen colours, and
+            why nothing is used."""
+            if self._loaded is None or self._loaded[0] != key:
+                self._loaded = key, whole_cloud(self._context.session, scan.name)
+            whole = self._loaded[1]
+            try:
+                return whole, used_points(self._context.session, whole), colour, ""
+            except InputError as error:  # all is shown, so that the region can be put around it
+                return whole, whole, colour, str(error)
+
+        used = session.restriction(scan.name)
+        self._painter.request("cloud", (key, used, self._redraws, colour), make, self._draw_cloud)
 
     def _shown_scans(self) -> tuple[str, ...]:
         """Return the names of the scans in the 3D view: those in place, or the chosen one."""
-        session = self._snapshot.session if self._snapshot else None
-        if session is not None and self._view.value == ALIGNED:
-            return tuple(scan.name for scan in session.scans if is_placed(scan))
+        if self._session is not None and self._view.value == ALIGNED:
+            return tuple(scan.name for scan in self._session.scans if scan.is_placed)
         return (self._scan.value,)
 
     def _offer_views(self, scans: Sequence[ScanView]) -> None:
         """Offer to view the aligned scans together, and do so when another one came to its place."""
-        placed = tuple(sorted(scan.name for scan in scans if is_placed(scan)))
+        placed = tuple(sorted(scan.name for scan in scans if scan.is_placed))
         together = [(ALIGNED, f"{len(placed)} scans in place")] if len(placed) > 1 else []
         self._view.offer([(ONE, "this scan"), *together], ONE)
         if together and self._placed is not None and set(placed) - set(self._placed):
@@ -290,9 +298,9 @@ class Panel(StepPanel):
     def _draw_placement(self, scan: ScanView, is_busy: bool) -> None:
         """State where the chosen scan is among the others, or why it is kept apart."""
         placement = scan.placement
-        change(self._place, visible=scan.cloud == "fresh" and not is_placed(scan), disabled=is_busy)
-        change(self._take_out, visible=is_placed(scan), disabled=is_busy)
-        tone: Tone = "good" if is_placed(scan) else "warning"
+        change(self._place, visible=scan.cloud == "fresh" and not scan.is_placed, disabled=is_busy)
+        change(self._take_out, visible=scan.is_placed, disabled=is_busy)
+        tone: Tone = "good" if scan.is_placed else "warning"
         self._placement.set(
             "" if placement is None else paragraph(coloured(f"{scan.label}: {placement.summary()}", tone))
         )
@@ -327,7 +335,7 @@ class Panel(StepPanel):
             return
         is_new = whole is not self._whole
         self._whole, self._cloud = whole, cloud
-        painted, bar = painting(cloud, colour)
+        painted, bar = paint_cloud(cloud, colour)
         (points,) = self._editing.set_scans([(cloud, None)])
         shown = self._scene.cloud(LAYER, "cloud", points, painted)
         self._scene.show(LAYER, self._visible)
@@ -340,11 +348,6 @@ class Panel(StepPanel):
             self._point.set("")
         self._show_view()
 
-    def _show_view(self) -> None:
-        """Move the browsers' views to the cloud, if it is visible."""
-        if self._visible and self._cloud is not None:
-            self._context.viewpoints.show(f"{LAYER} {self._cloud.name}", self._cloud.points)
-
     def _show_point(self, origin: np.ndarray, direction: np.ndarray) -> None:
         """Show the values of the point closest to the clicked ray."""
         cloud = self._cloud
@@ -354,11 +357,6 @@ class Panel(StepPanel):
         u, v = pixel
         self._point.set(point_html(cloud, u, v))
         self._scene.mark(LAYER, "picked", cloud.points[v, u], f"({u}, {v}): z {cloud.points[v, u, 2]:.3f} mm")
-
-
-def is_placed(scan: ScanView) -> bool:
-    """Whether the scan is in its place beside others."""
-    return scan.placement is not None and scan.placement.T_first_scan is not None
 
 
 def aligned_html(aligned: AlignedScans) -> Html:
@@ -389,7 +387,7 @@ def live_html(live: LiveView, shown: int) -> Html:
     return Html(paragraph(Html(html)) + paragraph(coloured(note, "dim")))
 
 
-def painting(cloud: ScanCloud, colour: str) -> tuple[np.ndarray, Html]:
+def paint_cloud(cloud: ScanCloud, colour: str) -> tuple[np.ndarray, Html]:
     """Colour a cloud by one of COLOURS: ((h, w) grey levels or (h, w, 3) RGB, uint8; the legend)."""
     if colour == "error":
         if not cloud.errors:

@@ -28,7 +28,7 @@ _EXPLANATIONS = {
 }
 
 
-class Panel(StepPanel):
+class TargetPanel(StepPanel):
     """Panel of the step Target."""
 
     key = "target"

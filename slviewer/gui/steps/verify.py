@@ -5,7 +5,7 @@ from typing import Any
 
 import viser
 
-from slviewer.gui.inputs import Choice, change, display_name
+from slviewer.gui.inputs import Choice, change, display_name, scan_options
 from slviewer.gui.panel import PanelContext, StepPanel
 from slviewer.gui.pictures import PLOT_PX, Plot
 from slviewer.gui.preview import draw_preview, exposure_html, legend
@@ -32,7 +32,7 @@ MUCH_MASKED = 0.2
 """Share of a scan that is reported as a warning."""
 
 
-class Panel(StepPanel):
+class VerifyPanel(StepPanel):
     """Panel of the step Verify."""
 
     key = "verify"
@@ -41,7 +41,6 @@ class Panel(StepPanel):
     def __init__(self, context: PanelContext) -> None:
         super().__init__(context)
         self._measured: tuple[str, ...] = ()
-        self._cloud: result_views.ScanCloud | None = None
 
     def build(self) -> None:
         """Create the inputs of capture, results and recorded captures."""
@@ -90,7 +89,7 @@ class Panel(StepPanel):
             rig = snapshot.rig
             change(self._capture_folder, visible=rig.state != "none")
             for button in (self._plane, self._sphere):
-                change(button, disabled=not ready or rig.state != "open" or rig.capture is not None)
+                change(button, disabled=not (ready and rig.is_idle))
             self._simulated.draw(snapshot)
             if session is None or not ready:
                 for folder in (self._recorded_folder, self._result_folder, self._table_folder):
@@ -128,7 +127,7 @@ class Panel(StepPanel):
         names = {scan.name for scan in waiting}
         change(self._recorded_folder, visible=bool(session.scans))
         self._recorded.offer(
-            [(scan.name, display_name(scan.name, scan.label)) for scan in waiting]
+            scan_options(waiting)
             + [
                 (scan.name, f"{display_name(scan.name, scan.label)}, measured")
                 for scan in session.scans
@@ -142,7 +141,7 @@ class Panel(StepPanel):
     def _refresh(self) -> None:
         """Request the error maps and the cloud of the chosen result."""
         with self._lock:
-            session = self._snapshot.session if self._snapshot else None
+            session = self._session
             name = self._result.value
             found = session.list_records(Verification) if session else []
             view = next((each for each in found if each.name == name), None)
@@ -171,11 +170,6 @@ class Panel(StepPanel):
         self._legend.set(colour_bar(f"−{limit:g} mm", f"+{limit:g} mm", "error", title))
         self._show_view()
 
-    def _show_view(self) -> None:
-        """Move the browsers' views to the cloud, if it is visible."""
-        if self._visible and self._cloud is not None:
-            self._context.viewpoints.show(f"{LAYER} {self._cloud.name}", self._cloud.points)
-
     # requests
 
     def _request_verification(self, names: Sequence[str], shape: Shape) -> None:
@@ -186,7 +180,7 @@ class Panel(StepPanel):
 
     def _request_all(self, shape: Shape) -> None:
         """Request the verification of all captures of a shape that have none yet."""
-        session = self._snapshot.session if self._snapshot else None
+        session = self._session
         if session is not None:
             self._request_verification(
                 [scan.name for scan in _list_unverified(session) if shape_of(scan) == shape], shape

@@ -12,8 +12,9 @@ from typing import IO
 from slviewer.errors import InputError
 from slviewer.session.atomic import format_bytes
 from slviewer.session.importers.images import IMAGE_SUFFIXES
-from slviewer.session.importers.imported import listed, visible
+from slviewer.session.importers.imported import visible
 from slviewer.session.importers.layouts import layouts
+from slviewer.session.names import join_names
 
 MOST_BYTES = 20 * 10**9
 """Unpacked; a hundred poses of 50 frames of 4 MB."""
@@ -52,7 +53,7 @@ def unpack(
                 raise InputError(f"the zip holds {info.filename} twice: make the zip again") from error
             done += info.file_size
             progress(done / max(total, 1))
-    warnings = [f"{listed(others)} in the zip: neither an image nor a TOML, and not used"] if others else []
+    warnings = [f"{join_names(others)} in the zip: neither an image nor a TOML, and not used"] if others else []
     return _innermost_folder(folder), warnings
 
 

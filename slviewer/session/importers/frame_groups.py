@@ -12,8 +12,8 @@ import msgspec
 from slviewer.errors import InputError
 from slviewer.fringe.sequence import Axis, Frame, Kind
 from slviewer.session.importers.images import IMAGE_SUFFIXES
-from slviewer.session.importers.imported import listed, visible
-from slviewer.session.names import natural_key
+from slviewer.session.importers.imported import visible
+from slviewer.session.names import join_names, natural_key
 
 _Exposure = Annotated[float, msgspec.Meta(gt=0)] | None
 
@@ -120,7 +120,7 @@ class FrameGroup:
                 continue
             matches = match_files(folder, name)
             if len(matches) > 1:
-                names = listed([file.name for file in matches])
+                names = join_names([file.name for file in matches])
                 raise InputError(f'{self.where}: "{name}" matches {names}: name one file')
             files += matches
         return files

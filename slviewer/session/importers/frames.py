@@ -72,9 +72,9 @@ from slviewer.session.importers.imported import (
     ImportableRecording,
     Imports,
     collect_captures,
-    listed,
     strangers_warning,
 )
+from slviewer.session.names import join_names
 from slviewer.session.reading import read_toml
 
 _KEYS = {*SEQUENCE_KEYS, "frames", "order", "channel"}
@@ -106,7 +106,9 @@ class Description:
             self._check_selected(selected)
             matched = [file for files in selected for file in files]
             if double := {file.name for file in matched if matched.count(file) > 1}:
-                raise InputError(f"{listed(sorted(double))} would show two patterns: correct the patterns of the names")
+                raise InputError(
+                    f"{join_names(sorted(double))} would show two patterns: correct the patterns of the names"
+                )
         return tuple(matched[index] for index in self.files_order)
 
     def _check_selected(self, selected: Sequence[Sequence[Path]]) -> None:
@@ -124,7 +126,7 @@ class Description:
             names = {file.name for file in files}
             missing += [name for name in group.files if has_wildcard(name) or Path(name).name not in names]
         if missing:
-            raise InputError(f"it lacks {listed(missing)}, which the TOML names: add them")
+            raise InputError(f"it lacks {join_names(missing)}, which the TOML names: add them")
 
     def is_capture(self, folder: Path) -> bool:
         """Return whether a folder holds a named file, or more than half of a capture's images."""

@@ -7,7 +7,8 @@ from slviewer.errors import InputError
 from slviewer.fringe.guess import Guess, guess_sequence
 from slviewer.session.importers.frame_groups import images_by_name
 from slviewer.session.importers.images import DEFAULT_CHANNEL, Channel, read_frames
-from slviewer.session.importers.imported import listed, visible
+from slviewer.session.importers.imported import visible
+from slviewer.session.names import join_names
 from slviewer.session.reading import expand_user
 from slviewer.session.toml import format_value, table_lines
 
@@ -55,7 +56,7 @@ def _capture_folder(source: Path) -> Path:
 def _format_span(names: list[str], indices: tuple[int, ...]) -> str:
     """Format the names at some indices: "first to last" where they are consecutive, else a list."""
     whole = len(indices) > 1 and indices == tuple(range(indices[0], indices[-1] + 1))
-    return f"{names[indices[0]]} to {names[indices[-1]]}" if whole else listed([names[i] for i in indices])
+    return f"{names[indices[0]]} to {names[indices[-1]]}" if whole else join_names([names[i] for i in indices])
 
 
 def _format_toml(

@@ -11,7 +11,7 @@ from slviewer.errors import InputError
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.session.capture import NewCapture
 from slviewer.session.importers.images import DEFAULT_CHANNEL, IMAGE_SUFFIXES, Channel, read_frames
-from slviewer.session.names import natural_key, new_name
+from slviewer.session.names import join_names, natural_key, new_name
 from slviewer.session.reading import expand_user
 
 _MOST_REASONS = 3
@@ -151,7 +151,9 @@ def check_complete(images: Mapping[tuple[int, ...], Path], stem: str, count: int
     if missing := [number for number in range(first, end) if (number,) not in images]:
         written = [run for (n,), file in images.items() for run in re.findall(r"\d+", file.stem) if int(run) == n]
         digits = min(map(len, written), default=2)
-        raise InputError(f"it lacks {stem}{listed([f'{n:0{digits}d}' for n in missing])}: copy or record them again")
+        raise InputError(
+            f"it lacks {stem}{join_names([f'{n:0{digits}d}' for n in missing])}: copy or record them again"
+        )
 
 
 def has_images(folder: Path, pattern: re.Pattern[str]) -> bool:
@@ -199,7 +201,7 @@ def none_usable(skipped: Sequence[Skipped]) -> InputError:
     reasons: dict[str, list[str]] = {}
     for each in skipped:
         reasons.setdefault(each.reason.removeprefix(f"{each.name}: "), []).append(each.name)
-    shown = [f"{listed(names, 3)}: {reason}" for reason, names in list(reasons.items())[:_MOST_REASONS]]
+    shown = [f"{join_names(names, 3)}: {reason}" for reason, names in list(reasons.items())[:_MOST_REASONS]]
     more = [f"and {len(reasons) - len(shown)} more reasons"] if len(reasons) > len(shown) else []
     return InputError(f"none of the {len(skipped)} captures can be imported. " + "; ".join(shown + more))
 
@@ -242,13 +244,8 @@ def strangers_warning(folder: Path, files: Sequence[Path]) -> list[str]:
     if not files:
         return []
     images = [file for file in files if file.suffix.lower() in IMAGE_SUFFIXES]
-    shown = listed([file.name for file in (*images, *(file for file in files if file not in images))])
+    shown = join_names([file.name for file in (*images, *(file for file in files if file not in images))])
     return [f"{folder.parent.name}/{folder.name}: {shown} left aside: not part of the layout"]
-
-
-def listed(names: Sequence[str], most: int = 6) -> str:
-    """Format names for a sentence, the first few of many."""
-    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
 def _name_pattern(folder: Path) -> str:

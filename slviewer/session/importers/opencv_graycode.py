@@ -21,9 +21,9 @@ from slviewer.session.importers.imported import (
     Imports,
     collect_captures,
     has_images,
-    listed,
     strangers_warning,
 )
+from slviewer.session.names import join_names
 
 _ILLUMINATED, _MOSTLY = 0.25, 0.9
 """Share of the largest difference from which on a pixel counts; share of these in which white is brighter than black:
@@ -55,7 +55,7 @@ def _read(
         """Return the recording of a folder, and warnings about images that are not part of it."""
         files = select(folder)
         if len(kinds := {re.sub(r"\d+$", "", file.stem) for file in files}) > 1:
-            shown = listed([f"{kind}N" for kind in sorted(kinds)])
+            shown = join_names([f"{kind}N" for kind in sorted(kinds)])
             raise InputError(f'it holds images named {shown}: choose one with --files "{min(kinds)}*"')
         shown_sequence = _fit_sequence(sequence, len(files))
         _check_shadow_images(files, shown_sequence)

@@ -15,11 +15,11 @@ from slviewer.session.importers.imported import (
     ImportableRecording,
     check_complete,
     define_layout,
-    listed,
     match_images,
     strangers_warning,
     visible,
 )
+from slviewer.session.names import join_names
 
 _STEPS, _PERIOD_PX, _BITS = 18, 18.0, 7
 _CODED = _STEPS + _BITS
@@ -53,8 +53,8 @@ def _describe(pose: Path, name: str, projector: tuple[int, int]) -> tuple[Import
             raise InputError(f"folder {folder.name}: {error}") from error
         if extra := [file.name for (number,), file in images.items() if number > max(_TEXTURES)]:
             raise InputError(
-                f"folder {folder.name} holds {listed(extra)}, beyond the p18 layout's F00 to F26: move them away, or "
-                "describe the frames in a TOML"
+                f"folder {folder.name} holds {join_names(extra)}, beyond the p18 layout's F00 to F26: move them away, "
+                "or describe the frames in a TOML"
             )
         warnings += strangers_warning(folder, others)
         files += list(images.values())[:_CODED]
@@ -75,7 +75,7 @@ def _axis_folders(pose: Path) -> list[tuple[Path, Axis]]:
     """Return the axis folders that exist, V before H."""
     there = [entry for entry in visible(pose) if entry.is_dir() and entry.name.lower() in _AXES]
     if len({entry.name.lower() for entry in there}) < len(there):
-        raise InputError(f"it holds {listed(sorted(entry.name for entry in there))}: keep one folder an axis")
+        raise InputError(f"it holds {join_names(sorted(entry.name for entry in there))}: keep one folder an axis")
     return sorted(((entry, _AXES[entry.name.lower()]) for entry in there), key=lambda folder_axis: folder_axis[1])
 
 

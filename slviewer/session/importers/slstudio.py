@@ -25,10 +25,10 @@ from slviewer.session.importers.imported import (
     check_complete,
     define_layout,
     has_images,
-    listed,
     match_images,
     strangers_warning,
 )
+from slviewer.session.names import join_names
 
 Codec = Literal["2x3", "nstep", "3", "4", "gray"]
 _FILE = re.compile(r"frameSeq_(\d+)", re.IGNORECASE)
@@ -76,7 +76,7 @@ def _identify_sequence(projector: tuple[int, int], images: int, codec: Codec | N
         what = f"codec {codec}" if codec else "any codec"
         raise InputError(f"it holds {images} frames, which {what} does not show: choose another --codec, or use a TOML")
     if len(candidates) > 1:
-        shown = listed([f"{each} along {' and '.join(axes)}" for each, axes in candidates])
+        shown = join_names([f"{each} along {' and '.join(axes)}" for each, axes in candidates])
         raise InputError(f"{images} frames may be {shown}: choose with --codec")
     sequence, axes = candidates[0]
     cells: PerAxis[float | None] | None = (
