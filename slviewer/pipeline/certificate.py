@@ -99,7 +99,7 @@ class Certificate(msgspec.Struct, frozen=True):
 
 
 @dataclass(frozen=True)
-class Check:
+class CheckedItem:
     """One thing that was checked, what was found, and a sentence on it."""
 
     what: str
@@ -111,7 +111,7 @@ class Check:
 class ReportCheck:
     """Whether a report's figures follow from a session's frames."""
 
-    checks: tuple[Check, ...]
+    checks: tuple[CheckedItem, ...]
 
     @property
     def failure(self) -> str:
@@ -232,43 +232,43 @@ def _measurement_figures(measured: Measurement) -> dict[str, float]:
     return values | {f"U of {q.name}, {q.unit}": q.U for q in measured.quantities if q.U is not None}
 
 
-def _check_page(page: str, certificate: Certificate) -> Check:
+def _check_page(page: str, certificate: Certificate) -> CheckedItem:
     """Return whether the page is the one that was written with its certificate."""
     if page_digest(page) == certificate.page:
-        return Check("page", "same", "as it was written")
-    return Check("page", "differs", "its text, pictures or numbers were changed after it was written")
+        return CheckedItem("page", "same", "as it was written")
+    return CheckedItem("page", "differs", "its text, pictures or numbers were changed after it was written")
 
 
-def _check_versions(certificate: Certificate) -> list[Check]:
+def _check_versions(certificate: Certificate) -> list[CheckedItem]:
     """Return a line about the software, where it is another than the report's."""
     changed = [
         f"{name} {certificate.software.get(name, '?')} then, {now} now"
         for name, now in _software().items()
         if certificate.software.get(name) != now
     ]
-    return [Check("software", "not recomputed", "; ".join(changed))] if changed else []
+    return [CheckedItem("software", "not recomputed", "; ".join(changed))] if changed else []
 
 
-def _check_frames(store: Session, certificate: Certificate) -> list[Check]:
+def _check_frames(store: Session, certificate: Certificate) -> list[CheckedItem]:
     """Read every capture that the report names, and compare the hash of each frame."""
     captures = {capture.name: capture for capture in store.captures()}
     checks = []
     for name, given in certificate.captures.items():
         what = f"{FRAMES}{name}"
         if name not in captures:
-            checks.append(Check(what, "missing", "the session has no such capture, or it is damaged"))
+            checks.append(CheckedItem(what, "missing", "the session has no such capture, or it is damaged"))
             continue
         try:
             now = captures[name].verify()
         except SlviewerError as error:
-            checks.append(Check(what, "differs", str(error)))
+            checks.append(CheckedItem(what, "differs", str(error)))
             continue
         changed = [i for i, (a, b) in enumerate(zip(given["frames"], now, strict=False)) if a != b]
         if changed or len(now) != len(given["frames"]) or captures[name].hash != given["hash"]:
             where = f"frame {changed[0] + 1}" if changed else "the description of the capture"
-            checks.append(Check(what, "differs", f"{where} is another than the report's"))
+            checks.append(CheckedItem(what, "differs", f"{where} is another than the report's"))
         else:
-            checks.append(Check(what, "same", f"{len(now)} frames"))
+            checks.append(CheckedItem(what, "same", f"{len(now)} frames"))
     return checks
 
 
@@ -456,15 +456,17 @@ def _note_failure(why: dict[str, str], *results: str) -> Iterator[None]:
         why |= dict.fromkeys(results, str(error))
 
 
-def _compare(name: str, given: Mapping[str, float], made: Mapping[str, float] | None, why: Mapping[str, str]) -> Check:
+def _compare(
+    name: str, given: Mapping[str, float], made: Mapping[str, float] | None, why: Mapping[str, str]
+) -> CheckedItem:
     """Return whether a result's figures are those that were computed again."""
     if made is None:
-        return Check(name, "not recomputed", why.get(name, "the session no longer holds what it was made with"))
+        return CheckedItem(name, "not recomputed", why.get(name, "the session no longer holds what it was made with"))
     for key, value in given.items():
         now = made.get(key, np.nan)
         if not np.isclose(now, value, rtol=RELATIVE, atol=ABSOLUTE, equal_nan=True):
-            return Check(name, "differs", f"{key}: {value:.6g} in the report, {now:.6g} now")
-    return Check(name, "same", f"{len(given)} figures")
+            return CheckedItem(name, "differs", f"{key}: {value:.6g} in the report, {now:.6g} now")
+    return CheckedItem(name, "same", f"{len(given)} figures")
 
 
 def certify_page(certificate: Certificate, page: str) -> str:

@@ -29,7 +29,7 @@ from slviewer.pipeline.operation import Found, Job, operation
 from slviewer.pipeline.scale import describe_scale, scale_factor
 from slviewer.pipeline.scan_edits import resolve_region, restrict_cloud, restriction_notes
 from slviewer.reconstruction.cloud import Cloud
-from slviewer.records.merge import ContradictingPair, Loop, MarkerPair, Merge, RefusedPair, Registered
+from slviewer.records.merge import ContradictingPair, LoopClosure, MarkerPair, Merge, RefusedPair, Registered
 from slviewer.records.plain import from_plain
 from slviewer.registration.markers import MeasuredMarkers, fit_marker_pose, marker_notes, measure_markers
 from slviewer.registration.multiway import MultiwayAlignment, Pair, Starts
@@ -327,7 +327,9 @@ def _make_record(registered: ObjectAlignment, fused: Fused, **origin: Any) -> Me
         points=len(fused.surface),
         registered=[_make_registered(*pair, registration) for pair, registration in alignment.pairs.items()],
         loops=[
-            Loop(list(loop.names), loop.before.shift_mm, loop.before.turn_deg, loop.after.shift_mm, loop.after.turn_deg)
+            LoopClosure(
+                list(loop.names), loop.before.shift_mm, loop.before.turn_deg, loop.after.shift_mm, loop.after.turn_deg
+            )
             for loop in alignment.loops
         ],
         dropped=[RefusedPair(*pair, why) for pair, why in alignment.dropped.items()],

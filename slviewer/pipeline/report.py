@@ -94,11 +94,6 @@ def _collect_data(store: Session) -> SessionData:
         for name in available_models(store)
         if store.state_of(f"calibration/{name}") == "stale"
     ]
-    fits: list[PixelFitView] = []
-    if stereo is not None and "pixelwise" in available_models(store):
-        model = load_model(store, "pixelwise")
-        assert isinstance(model, PixelwiseModel)
-        fits = [PixelFitView(axis, fit.rms_mm, fit.poses) for axis, fit in model.fits.items()]
     excluded = store.excluded()
     verdict = load_last_verdict(store)
     judged = store.load_result("calibration/stereo", only=())[0].get("verdict") if stereo is not None else None
@@ -108,7 +103,7 @@ def _collect_data(store: Session) -> SessionData:
         name=store.folder.name,
         captures=[_describe_capture(c, stereo, excluded) for c in store.captures()],
         calibration=None if stereo is None else _load_calibration(store, stereo, observations),
-        pixel_fits=fits,
+        pixel_fits=[] if stereo is None else _load_pixel_fits(store),
         records=records,
         warnings=[*stale, *outdated],
         verdict=verdict,
@@ -118,6 +113,15 @@ def _collect_data(store: Session) -> SessionData:
         edits=[(scan, words) for scan in store.capture_names("scan") for words in list_edits(store, scan)[0]],
         **measured_views(store),
     )
+
+
+def _load_pixel_fits(store: Session) -> list[PixelFitView]:
+    """Return the pixel-wise fits by axis; none where there is no such calibration."""
+    if "pixelwise" not in available_models(store):
+        return []
+    model = load_model(store, "pixelwise")
+    assert isinstance(model, PixelwiseModel)
+    return [PixelFitView(axis, fit.rms_mm, fit.poses) for axis, fit in model.fits.items()]
 
 
 def _load_models(store: Session) -> ModelsView | None:

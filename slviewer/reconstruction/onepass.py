@@ -58,7 +58,7 @@ class PassResult:
 
 
 @dataclass(frozen=True, eq=False)
-class Job:
+class PassTask:
     """Description of the work that a device is prepared for: the ``shape`` (h, w) of a camera's frames, their layout,
     all ``frames`` that the axis is decoded from, whether the texture is the background of the fringes (``is_shaded``),
     and the calibration."""

@@ -13,7 +13,7 @@ from slviewer.fringe.decode import decode, pack_levels, texture
 from slviewer.fringe.layout import clip_level
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.geometry import cuda_device
-from slviewer.reconstruction.onepass import Job, LightLevels, OnePass, PassResult, one_pass_layout, texture_frame
+from slviewer.reconstruction.onepass import LightLevels, OnePass, PassResult, PassTask, one_pass_layout, texture_frame
 
 if TYPE_CHECKING:  # it imports CUDA
     from slviewer.reconstruction.onepass_cuda_card import Card
@@ -123,11 +123,11 @@ class CudaPass(OnePass):
             return self._scan_on_device(frames, replace(scan, light=self.light(frames)), repaired)
         return scan
 
-    def _job(self) -> Job:
+    def _job(self) -> PassTask:
         """Return the description of the work from which the device's kernels are compiled."""
         depths = self.model.rig if isinstance(self.model, StereoModel) else self._depths
         frames = tuple(self.sequence.select(self.axis))
-        return Job(self.shape, self.axis, self._layout, frames, self._ladder, depths, self._texture < 0)
+        return PassTask(self.shape, self.axis, self._layout, frames, self._ladder, depths, self._texture < 0)
 
     def _scan_on_processor(self, frames: np.ndarray, scan: PassResult) -> PassResult:
         """Compute a stereo calibration's scan on the processor."""

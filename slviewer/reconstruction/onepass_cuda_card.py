@@ -12,7 +12,7 @@ from slviewer.fringe.reference import dark_sigmas
 from slviewer.geometry.cuda_device import device_function
 from slviewer.geometry.rig import StereoRig
 from slviewer.geometry.triangulation import MARGIN, ray_depth
-from slviewer.reconstruction.onepass import Job, LightLevels, PassResult
+from slviewer.reconstruction.onepass import LightLevels, PassResult, PassTask
 from slviewer.reconstruction.onepass_cuda_spikes import spike_kernels
 from slviewer.reconstruction.onepass_cuda_sweep import frame_slots, sweep_kernel
 from slviewer.reconstruction.pixel_depths import INVALID, pixelwise_point, splined_point
@@ -27,7 +27,7 @@ class Card:
     All that it does is queued in ``stream``; only `fetch` waits. Errors are those of numba's CUDA.
     """
 
-    def __init__(self, job: Job, dtype: np.dtype) -> None:
+    def __init__(self, job: PassTask, dtype: np.dtype) -> None:
         layout, deep = job.layout, dtype == np.uint16
         pixels = job.shape[0] * job.shape[1]
         self.dtype, self._dark_sigmas = dtype, dark_sigmas(layout)
@@ -106,7 +106,7 @@ class Card:
         return int(highest[0])
 
 
-def _depths(job: Job) -> tuple[Callable[..., Any], np.ndarray, np.ndarray]:
+def _depths(job: PassTask) -> tuple[Callable[..., Any], np.ndarray, np.ndarray]:
     """Return the device function (pixel, phase, c, extra) that measures a pixel like `pixel_depths`, and two arrays:
     ``c`` (m, h, w) of the camera's pixels, and ``extra``. The pixel is a uint64, so that indices are not tested for
     their sign."""

@@ -28,7 +28,7 @@ from slviewer.fringe.kernels import (
 )
 from slviewer.fringe.kernels_coded import EDGE, FAR_EDGE, UNDECIDED, WEAK, WEAKER
 from slviewer.fringe.layout import Layout
-from slviewer.reconstruction.onepass import Job
+from slviewer.reconstruction.onepass import PassTask
 
 cuda: Any = import_module("numba.cuda")  # its own annotations are not those of what a kernel may call
 
@@ -45,7 +45,7 @@ def frame_slots(layout: Layout) -> list[int]:
     return [*steps, *layout.gray, *layout.inverse, *([] if layout.complementary is None else [layout.complementary])]
 
 
-def sweep_kernel(job: Job, slots: int, measure: Callable[..., Any], deep: bool) -> Any:
+def sweep_kernel(job: PassTask, slots: int, measure: Callable[..., Any], deep: bool) -> Any:
     """The kernel for one job and one of `onepass_cuda_card`'s ways to measure depth.
 
     ``slots``: frames on the device, those of `frame_slots` first. ``deep``: the largest grey level of all is needed,
@@ -212,7 +212,7 @@ def _compile_coded(layout: Layout, pixels: int) -> Any:
     return decode
 
 
-def _compile_levels(job: Job, pixels: int) -> Any:
+def _compile_levels(job: PassTask, pixels: int) -> Any:
     """Compile the device function that decodes a pixel by several periods: (absolute phase, reason, modulation,
     background)."""
     shift, ladder = _compile_shift(job.layout, pixels), job.ladder

@@ -60,7 +60,7 @@ class Registered(msgspec.Struct, frozen=True, kw_only=True):
         return dist(self.middle, before)
 
 
-class Loop(msgspec.Struct, frozen=True):
+class LoopClosure(msgspec.Struct, frozen=True):
     """The closure error of the pairs round these scans: as registered, and what the joint adjustment left."""
 
     scans: list[str]
@@ -118,7 +118,7 @@ class Merge(Record, frozen=True, kw_only=True):
     model: str = ""
     scale: str = ""
     registered: list[Registered] = []
-    loops: list[Loop] = []
+    loops: list[LoopClosure] = []
     dropped: list[RefusedPair] = []
     refused: list[RefusedPair] = []
     markers: list[MarkerPair] = []

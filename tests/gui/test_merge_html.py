@@ -11,7 +11,7 @@ from slviewer.gui.merge_html import merge_failure_html, merge_html, turntable_ht
 from slviewer.gui.merge_views import BY_SCAN, BY_SIGMA, OWN, SCAN_COLOURS, colour_merge
 from slviewer.gui.widgets import use_labels
 from slviewer.pipeline.stored_records import Stored, save_record
-from slviewer.records.merge import Loop, Merge, RefusedPair, Registered
+from slviewer.records.merge import LoopClosure, Merge, RefusedPair, Registered
 from slviewer.session.ply import write_ply
 from slviewer.session.store import Session
 
@@ -31,7 +31,7 @@ def test_pairs_loops_and_excluded_scans_are_named_by_labels() -> None:
         points=197_971,
         pairs={},
         registered=[pair("scan_03", "scan_02"), pair("scan_02", "scan_01", point_to_point_rms_mm=0.24)],
-        loops=[Loop(["scan_02", "scan_03", "scan_01"], 0.016, 0.0284, 0.004, 0.0059)],
+        loops=[LoopClosure(["scan_02", "scan_03", "scan_01"], 0.016, 0.0284, 0.004, 0.0059)],
         dropped=[RefusedPair("scan_03", "scan_01", "scan_03 -> scan_01 contradicts the other pairs by 3.1 mm")],
         refused=[RefusedPair("scan_10", "scan_01", "Only 3 % of the scan lies on the reference")],
         left_out={"scan_01": {"edges": 5500, "grazing": 0}, "scan_02": {"edges": 27, "unconfirmed": 8}},
@@ -49,7 +49,7 @@ def test_pairs_loops_and_excluded_scans_are_named_by_labels() -> None:
     before = pair("scan_02", "scan_01", sigma_shift_mm=None, sigma_turn_deg=None, middle=None)
     old = Merge(reference="scan_01", scans=["scan_01", "scan_02"], points=10, pairs={}, registered=[before])
     bare = unescape(merge_html(Stored("1", "1", old), LABELS))
-    assert "0.117" in bare and "Letter" not in bare and "Loop" not in bare and "sigma" not in bare.lower()
+    assert "0.117" in bare and "Letter" not in bare and "LoopClosure" not in bare and "sigma" not in bare.lower()
 
 
 def test_labels_in_messages_and_angles() -> None:
