@@ -142,8 +142,10 @@ def test_plane_and_sphere_are_measured_and_exported(measured: tuple[Page, Operat
     click(page, "Write CSV")
     with page.expect_download() as download:
         page.get_by_text("Download figures.csv").click()
-    lines = Path(download.value.path()).read_text().splitlines()
-    assert lines[0].startswith("capture,name,shape,model,rms_mm") and len(lines) == 5
+    rows = list(csv.DictReader(Path(download.value.path()).read_text().splitlines()))
+    verified = [(row["record"], row["model"]) for row in rows if row["kind"] == "verify"]
+    assert len(verified) == 4 and {model for _, model in verified} == {"stereo", "pixelwise"}
+    assert all(0 < float(row["RMS mm"]) < 0.5 for row in rows if row["kind"] == "verify")
     assert errors == []
 
 

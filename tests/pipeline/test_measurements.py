@@ -22,6 +22,8 @@ from slviewer.pipeline import measurements
 from slviewer.pipeline.measured_surface import MeasuredSurface, load_surface
 from slviewer.pipeline.report import report
 from slviewer.pipeline.simulate import save_true_stereo
+from slviewer.pipeline.stored_records import save_record
+from slviewer.records.merge import Merge
 from slviewer.session.measurements import rename_measurement, restore_measurement, trash_measurement
 from slviewer.session.ply import read_ply, write_ply
 from slviewer.session.store import Session
@@ -255,8 +257,9 @@ def test_a_merge_is_measured_on_too(folder, balls, regions) -> None:
         points = balls.points[chosen]
         sigma = np.full(len(points), 0.05, np.float32)
         write_ply(store.exports / "merged_1.ply", points, normals=balls.normals[chosen], scalars={"sigma": sigma})
-        meta = {"ply": "merged_1.ply", "model": "stereo", "inputs": store.input_hashes("balls")}
-        store.save_result("merge/1", meta, {})
+        inputs = store.input_hashes("balls")
+        made = Merge(reference="balls", scans=["balls"], pairs={}, ply="merged_1.ply", model="stereo", inputs=inputs)
+        save_record(store, "1", made, {})
     on = load_surface(folder, "merge/1")
     region = regions[0]
     one = measurements.add_fit(folder, on, "sphere", ball_about(balls, region))

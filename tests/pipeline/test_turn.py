@@ -47,7 +47,7 @@ def test_one_command_makes_a_watertight_mesh_of_a_turned_object(tmp_path: Path, 
     assert not missing_facts(text, "12 scans", "watertight") and "features" not in error
     record = json.loads((tmp_path / "turn.json").read_text())
     assert record["captures"] == {f"turn1_{k + 1:02d}": 30.0 * k for k in range(12)}
-    assert "turntable" in {pair["start"] for pair in record["merge"]["registered"]}
+    assert "turntable" in {pair["start"] for pair in record["merge"]["merge"]["1"]["registered"]}
     mesh = trimesh.load(out, process=False)
     assert mesh.is_watertight
     vertices, triangles = stone()
