@@ -195,7 +195,7 @@ def test_scans_are_reconstructed_picked_merged_and_exported(
     choose(page, "Start from", "features")
     click(page, "Merge 2 scans")
     expect(page.get_by_text(re.compile("in the frame of"))).to_be_visible()
-    expect(page.get_by_text(re.compile(r"^0\.0\d+\smm")).first).to_be_visible()
+    expect(page.get_by_text(re.compile(r"^0\.\d{3}$")).first).to_be_visible()
     expect(page.get_by_text("Not merged.")).to_be_hidden()
     choose(page, "3D view", "merged, uncertainty")
     expect(page.get_by_text("uncertainty along the normal (1 sigma)")).to_be_visible()
@@ -310,6 +310,7 @@ def test_part_is_measured_and_compared_with_its_nominal(
     click(page, "Fit sphere")
     radius = came(operator, before + 3).quantities[0]
     assert radius.U is not None and abs(radius.value - 98.0) < max(2 * radius.U, 0.1)  # the simulated sphere's, mm
+    expect(page.get_by_text(re.compile("ball of radius 30"))).to_be_visible()  # or the name typed is that of before
     field(page, "New name").fill("Ball <i>")
     page.get_by_role("button", name="Rename", exact=True).click()
     expect(page.get_by_text("Ball <i>").first).to_be_visible()

@@ -7,6 +7,7 @@ import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,6 +18,10 @@ from small_fields import fit_few_cells
 from wizard_events import HANG_S, SPARING, list_texts
 
 from slviewer.errors import Cancelled
+from slviewer.pipeline.merge import MergeSettings, merge
+from slviewer.pipeline.operation import Operation
+from slviewer.pipeline.reconstruct import ReconstructSettings, reconstruct
+from slviewer.pipeline.verify import VerifySettings, verify
 from slviewer.records.verification import Verification
 from slviewer.session.ply import read_ply
 from slviewer.session.store import Session
@@ -142,6 +147,11 @@ def test_panels_find_what_they_draw(operator: Operator) -> None:
     assert result_views.merged_cloud(store, "1").normals is not None
 
 
+def run_guarded(operation: Operation[..., Any, Any], settings: object) -> Callable[[Session, Reporter], object]:
+    """Return the job of an operation, which saves nothing once it is cancelled."""
+    return lambda store, report: operation.run(store.guarded(report.saving), settings, report, print)
+
+
 @pytest.mark.parametrize(
     ("where", "make"),
     [
@@ -153,15 +163,15 @@ def test_panels_find_what_they_draw(operator: Operator) -> None:
         pytest.param(
             "poses.observe", lambda store, r: tasks.calibrate_session(store, TARGET, r, print), marks=pytest.mark.slow
         ),
-        ("capture_clouds.reconstruct", lambda store, r: tasks.reconstruct_capture(store, "scan_01", None, r, print)),
+        ("capture_clouds.reconstruct_cloud", run_guarded(reconstruct, ReconstructSettings("scan_01"))),
         pytest.param(
             "merge.fuse",
-            lambda store, r: tasks.merge_scans(store, ["scan_01"], "scan_02", r, print),
+            run_guarded(merge, MergeSettings(["scan_01"], "scan_02")),
             marks=pytest.mark.slow,
         ),
         pytest.param(
-            "verify.compare",
-            lambda store, r: tasks.verify_captures(store, ["plane_01"], "plane", None, r, print),
+            "verify.fit_clouds",
+            run_guarded(verify, VerifySettings(["plane_01"], "plane")),
             marks=pytest.mark.slow,
         ),
     ],
