@@ -12,8 +12,8 @@ from clocks import HANG_S
 
 import slviewer as sl
 from slviewer.cli import main
+from slviewer.pipeline import operations
 from slviewer.pipeline.certificate import make_certificate
-from slviewer.pipeline.operations import OPERATIONS as REGISTERED
 from slviewer.pipeline.reconstruct import ReconstructSettings
 from slviewer.session.store import Session
 from slviewer.wizard.operator import Operator
@@ -30,7 +30,29 @@ class Operation:
     capture: str
 
 
+BALL = """kind = "sphere"
+name = "ball"
+certificate = "K 1"
+calibrated = {diameter_mm = 196.0, diameter_U_mm = 0.01, form_mm = 0.01, form_U_mm = 0.01, temperature_C = 20.0, \
+expansion_ppm_K = 0.0, expansion_U_ppm_K = 0.0}
+measured = {temperature_C = 20.0, temperature_U_K = 0.1, captures = ["sphere_3"]}
+limits = {form_mm = 5.0}
+""".replace("\\\n", "")
+
+
+def find_ball(session: Path) -> str:
+    """Path of the file of the ball's certificate, beside the session."""
+    return str(session.parent / "ball.toml")
+
+
 OPERATIONS = {
+    "accept": Operation(
+        ("accept", "SESSION", "--artefact", "BALL"),
+        lambda session: sl.accept(session, find_ball(session)),
+        lambda operator: operator.run("accept", artefact=find_ball(operator.session.folder)),  # type: ignore[union-attr]
+        ("acceptance/1",),
+        "sphere_3",
+    ),
     "reconstruct": Operation(
         ("reconstruct", "SESSION", "object_r1"),
         lambda session: sl.reconstruct(session, "object_r1"),
@@ -70,7 +92,8 @@ OPERATIONS = {
 
 
 def by_terminal(operation: Operation, session: Path) -> None:
-    assert main([str(session) if word == "SESSION" else word for word in operation.terminal]) == 0
+    places = {"SESSION": str(session), "BALL": find_ball(session)}
+    assert main([places.get(word, word) for word in operation.terminal]) == 0
 
 
 def by_wizard(operation: Operation, session: Path) -> None:
@@ -96,6 +119,7 @@ def done(
     """An operation, and a session for each door by which it was asked for; all were equal before."""
     folder, operation = tmp_path_factory.mktemp("contract"), OPERATIONS[request.param]
     sessions = {door: shutil.copytree(recorded / "session", folder / door) for door in DOORS}
+    (folder / "ball.toml").write_text(BALL)
     for session in sessions.values():
         with Session.open(session, write=True) as store:
             board = store.load_capture("pose_03")
@@ -127,7 +151,9 @@ def test_every_door_stores_the_same_record(done: tuple[Operation, dict[str, Path
     terminal, *others = (records(session, operation.stored) for session in sessions.values())
     for other in others:
         for name, (meta, arrays) in terminal.items():
-            own = {"drift/1": ("hash", "time")}.get(name, () if name.startswith(("clouds/", "verify/")) else ("hash",))
+            own = {"drift/1": ("hash", "time"), "acceptance/1": ("hash", "time")}.get(
+                name, () if name.startswith(("clouds/", "verify/")) else ("hash",)
+            )
             assert_same(*({k: v for k, v in each.items() if k not in own} for each in (other[name][0], meta)), name)
             assert arrays.keys() == other[name][1].keys()
             for key, array in arrays.items():
@@ -144,7 +170,9 @@ def test_what_the_terminal_made_is_done_in_the_wizard_and_certified(done: tuple[
     with Session.open(sessions["terminal"]) as store:
         certificate = make_certificate(store)
     assert set(operation.stored) <= set(certificate.results)
-    assert {name for name in operation.stored if not name.startswith("placement/")} <= set(certificate.figures)
+    assert {name for name in operation.stored if not name.startswith(("placement/", "acceptance/"))} <= set(
+        certificate.figures
+    )
 
 
 def test_verify_stores_the_cloud_that_reconstruct_does(recorded: Path, tmp_path: Path) -> None:
@@ -177,4 +205,4 @@ def test_a_session_in_use_is_read_and_the_result_is_not_stored(recorded: Path, t
 
 
 def test_every_operation_is_bound_by_the_contract() -> None:
-    assert set(OPERATIONS) == set(REGISTERED)
+    assert set(OPERATIONS) == set(operations.__all__) - {"OPERATIONS"}
