@@ -8,6 +8,9 @@ import pytest
 import trimesh
 
 from slviewer.cli import main
+from slviewer.pipeline.stored_records import load_record
+from slviewer.records.reconstruction import Reconstruction
+from slviewer.session.store import Session
 
 pytestmark = [pytest.mark.computes, pytest.mark.slow]  # two calibrations from large photographs
 
@@ -39,7 +42,8 @@ def test_poses_give_the_board(kamino: Path, tmp_path: Path, capsys: pytest.Captu
         ply = tmp_path / f"{k}.ply"
         assert main(["reconstruct", str(kamino), f"capture_{k}", "--out", str(ply)]) == 0
         text = capsys.readouterr().out
-        assert "axis y" in text  # the baseline is vertical
+        with Session.open(kamino) as store:
+            assert load_record(store, Reconstruction, f"capture_{k}").axis == "y"  # the baseline is vertical
         assert "stereo" in text and "pixelwise" in text and "coverage" in text
         points = np.asarray(trimesh.load(ply).vertices)
         centred = points - points.mean(0)
