@@ -21,7 +21,8 @@ from slviewer.evaluation.region import (
 from slviewer.evaluation.sphere import SphereResult, evaluate_sphere
 from slviewer.geometry.shapes import Plane, Sphere
 from slviewer.reconstruction.cloud import Cloud
-from slviewer.records.verification import ModelFit, Shape, Vector, Verification
+from slviewer.records.record import to_vector
+from slviewer.records.verification import ModelFit, Shape, Verification
 
 LEAST_SHARE = 0.5
 """Of the scene's measured pixels, that a plane must hold to be what was captured."""
@@ -88,13 +89,13 @@ class Comparison:
             models={
                 model: ModelFit(
                     points=result.points,
-                    excluded=result.set_aside,
+                    excluded=result.excluded,
                     rms_mm=result.rms_mm,
                     noise_floor_mm=_known(result.noise_floor_mm),
                     coverage=_known(self.coverage[model]),
                     radius_mm=result.radius_mm if isinstance(result, SphereResult) else None,
-                    centre_mm=_make_vector(result.sphere.centre) if isinstance(result, SphereResult) else None,
-                    normal=_make_vector(result.plane.normal) if isinstance(result, PlaneResult) else None,
+                    centre_mm=to_vector(result.sphere.centre) if isinstance(result, SphereResult) else None,
+                    normal=to_vector(result.plane.normal) if isinstance(result, PlaneResult) else None,
                     offset_mm=float(result.plane.offset) if isinstance(result, PlaneResult) else None,
                     masked=masked.get(model),
                 )
@@ -190,12 +191,6 @@ def _coverage_share(cloud: Cloud, region: np.ndarray, illuminated: np.ndarray | 
     if illuminated is None or measurable == 0:
         return float("nan")
     return np.count_nonzero(region & illuminated & cloud.mask) / measurable
-
-
-def _make_vector(values: np.ndarray) -> Vector:
-    """Return an array (3,) as plain numbers."""
-    x, y, z = map(float, values)
-    return x, y, z
 
 
 def _known(value: float) -> float | None:

@@ -10,11 +10,11 @@ from slviewer.errors import InputError
 from slviewer.geometry.robust import robust_sigma
 from slviewer.geometry.shapes import Plane, Sphere
 from slviewer.geometry.vectors import finite_rows, rms, unit_vectors
+from slviewer.records.verification import MAX_EXCLUDED
 
 Fitted = TypeVar("Fitted", Plane, Sphere)
 
-SET_ASIDE_SIGMA = 5.0
-SET_ASIDE_WARNING = 0.02
+MAX_SIGMA = 5.0
 LEAST_POINTS = 100
 
 
@@ -22,32 +22,32 @@ LEAST_POINTS = 100
 class ShapeResult:
     """Distances of a cloud from its own best plane or sphere.
 
-    ``points`` pixels were looked at; of these ``set_aside`` lie beyond 5 robust sigma and count neither in the fit nor
+    ``points`` pixels were evaluated; of these ``excluded`` lie beyond 5 robust sigma and count neither in the fit nor
     in ``rms_mm``, the root mean square of the perpendicular (radial) distances. ``noise_floor_mm`` is what that would
     be from the cloud's expected noise alone, over the same pixels; NaN where none is known. ``error_map`` ``(h, w)``
-    float32, mm, NaN where nothing was looked at, holds every distance, those set aside too: positive towards the
+    float32, mm, NaN where nothing was evaluated, holds every distance, those excluded too: positive towards the
     camera for a plane, outwards for a sphere. ``inliers`` ``(h, w)`` bool says which pixels counted.
     """
 
     rms_mm: float
     noise_floor_mm: float
     points: int
-    set_aside: int
+    excluded: int
     error_map: np.ndarray
     inliers: np.ndarray
 
     @property
-    def set_aside_share(self) -> float:
+    def excluded_share(self) -> float:
         """Share of the points that were excluded as outliers."""
-        return self.set_aside / self.points
+        return self.excluded / self.points
 
     @property
     def warning(self) -> str | None:
         """A warning if so many points were excluded that the RMS is not representative of the shape."""
-        if self.set_aside_share <= SET_ASIDE_WARNING:
+        if self.excluded_share <= MAX_EXCLUDED:
             return None
         return (
-            f"{100 * self.set_aside_share:.1f} % of the points are outliers, beyond {SET_ASIDE_SIGMA:g} robust "
+            f"{100 * self.excluded_share:.1f} % of the points are outliers, beyond {MAX_SIGMA:g} robust "
             "standard deviations, and not part of the RMS: look at the error map before you trust it."
         )
 
@@ -85,7 +85,7 @@ def within_sigmas(residuals: np.ndarray, points: np.ndarray) -> np.ndarray:
     Sigma is that of *all* residuals, so that it does not shrink from round to round until only the best are left; of
     exact points it is nothing but rounding, which excludes none of them.
     """
-    reach = max(SET_ASIDE_SIGMA * robust_sigma(residuals), 1e-9 * float(np.abs(points).max()))
+    reach = max(MAX_SIGMA * robust_sigma(residuals), 1e-9 * float(np.abs(points).max()))
     return np.abs(residuals - np.median(residuals)) <= reach
 
 
@@ -97,17 +97,17 @@ def fit_shape(
     fit: Callable[[np.ndarray], Fitted],
 ) -> tuple[Fitted, ShapeResult]:
     """Fit the shape to the measured pixels under ``mask`` of a cloud ``(h, w, 3)``, and evaluate the residuals."""
-    looked_at = mask & finite_rows(points)
-    chosen = points[looked_at].astype(np.float64)
+    evaluated = mask & finite_rows(points)
+    chosen = points[evaluated].astype(np.float64)
     if len(chosen) < LEAST_POINTS:
         raise InputError(f"{len(chosen)} points were measured in the region: at least {LEAST_POINTS} are needed.")
     shape, is_inlier = fit_settled(lambda some, _: fit(some), chosen, start)
     residuals = shape.distance(chosen)
 
     error_map = np.full(points.shape[:2], np.nan, dtype=np.float32)
-    error_map[looked_at] = residuals
+    error_map[evaluated] = residuals
     inliers = np.zeros(points.shape[:2], dtype=bool)
-    inliers[looked_at] = is_inlier
+    inliers[evaluated] = is_inlier
     floor = float("nan") if sigma_z is None else noise_floor(shape, chosen[is_inlier], sigma_z[inliers])
     error = rms(residuals[is_inlier])
     return shape, ShapeResult(error, floor, len(chosen), int(np.count_nonzero(~is_inlier)), error_map, inliers)

@@ -3,6 +3,8 @@
 from collections.abc import Sequence
 from typing import Any
 
+from slviewer.records.table import align_columns
+
 Row = dict[str, Any]
 """Column titles and cells; a title that ends in % or radius, or holds ratio, sets its column's decimals."""
 
@@ -15,24 +17,9 @@ def render(table: Sequence[Row]) -> str:
     if not table:
         return ""
     titles = list(dict.fromkeys(title for row in table for title in row))
-    words = [title.split() for title in titles]
-    height = max(len(w) for w in words)
-    head = [list(line) for line in zip(*([""] * (height - len(w)) + w for w in words), strict=True)]
     body = [[_format_cell(title, row.get(title)) for title in titles] for row in table]
-    widths = [max(len(line[k]) for line in head + body) for k in range(len(titles))]
-
-    def laid_out(line: list[str]) -> str:
-        """Return one row as text: the first cell aligned to the left, the others to the right."""
-        return "  ".join(
-            text.rjust(width) if k else text.ljust(width)
-            for k, (text, width) in enumerate(zip(line, widths, strict=True))
-        ).rstrip()
-
-    rule = "-" * (sum(widths) + 2 * (len(widths) - 1))
-    lines = [*map(laid_out, head), rule, *map(laid_out, body)]
-    if table[-1].get(titles[0]) == "mean":
-        lines.insert(-1, rule)
-    return "\n".join(lines)
+    is_left = [index == 0 for index in range(len(titles))]
+    return "\n".join(align_columns(titles, body, is_left, int(table[-1].get(titles[0]) == "mean")))
 
 
 def _format_cell(title: str, value: Any) -> str:

@@ -45,7 +45,7 @@ def _make_row(name: str, comparison: Comparison) -> Row:
             row[f"{model} radius"] = result.radius_mm
         if np.isfinite(comparison.coverage[model]):
             row[f"{model} coverage %"] = 100.0 * comparison.coverage[model]
-        row[f"{model} set aside %"] = 100.0 * result.set_aside_share
+        row[f"{model} set aside %"] = 100.0 * result.excluded_share
     return row | _rms_ratio(row, comparison)
 
 

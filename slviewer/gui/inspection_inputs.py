@@ -3,12 +3,12 @@
 import viser
 
 from slviewer.errors import InputError
-from slviewer.evaluation.acceptance.figures import Decision
 from slviewer.gui.inputs import Choice, change
 from slviewer.gui.panel import PanelContext
 from slviewer.gui.widgets import Html, Text, Tone, alert, coloured, link, paragraph, table
 from slviewer.inspection.parts import CharacteristicResult
 from slviewer.pipeline.inspect_parts import RULE
+from slviewer.records.acceptance import Decision
 from slviewer.session.inspection_plan import OWN_PLAN, Characteristic
 from slviewer.wizard.measure_requests import PARTS
 from slviewer.wizard.snapshot import InspectionView, Snapshot

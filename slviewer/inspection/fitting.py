@@ -8,7 +8,7 @@ import scipy.optimize
 
 from slviewer.errors import InputError
 from slviewer.evaluation.acceptance.figures import narrowest_range
-from slviewer.evaluation.fit import SET_ASIDE_SIGMA, SET_ASIDE_WARNING, fit_settled, within_sigmas
+from slviewer.evaluation.fit import MAX_SIGMA, fit_settled, within_sigmas
 from slviewer.geometry.robust import fit_reweighted, robust_sigma
 from slviewer.geometry.vectors import diagonal, finite_rows, rms
 from slviewer.inspection.features import Feature, Kind
@@ -16,6 +16,7 @@ from slviewer.inspection.quantities import Quantity
 from slviewer.inspection.starts import estimate_start, fit_plane_feature, fit_sphere_feature
 from slviewer.inspection.uncertainty import Shared, Spread, propagate_covariance, scatter_covariance
 from slviewer.records.plain import to_plain
+from slviewer.records.verification import MAX_EXCLUDED
 
 LEAST_POINTS = 50
 MAX_FITTED_POINTS = 20_000
@@ -114,9 +115,9 @@ def fit_feature(kind: Kind, points: np.ndarray, shared: Shared | None = None, ca
     spread = _estimate_spread(feature, basis, shared, calibration)
     _refuse_uncertain_radius(kind, feature, spread)
     warnings = []
-    if excluded_share > SET_ASIDE_WARNING:
+    if excluded_share > MAX_EXCLUDED:
         warnings.append(
-            f"{100 * excluded_share:.1f} % of the region lie beyond {SET_ASIDE_SIGMA:g} robust sigma "
+            f"{100 * excluded_share:.1f} % of the region lie beyond {MAX_SIGMA:g} robust sigma "
             f"of the {kind} and were excluded: see that it shows nothing else"
         )
     fitted = residuals[counted]

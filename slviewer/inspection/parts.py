@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from slviewer.evaluation.acceptance.figures import Decision
+from slviewer.records.acceptance import Decision
 
 
 @dataclass(frozen=True)

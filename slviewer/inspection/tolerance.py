@@ -5,8 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from slviewer.errors import InputError
-from slviewer.evaluation.acceptance.figures import AcceptanceFigure, Decision, judge_property
+from slviewer.evaluation.acceptance.figures import judge_property, make_length_error
 from slviewer.inspection.deviation import Deviation
+from slviewer.records.acceptance import Decision
 
 DECIDED: dict[Decision, str] = {"pass": "pass", "fail": "fail", "undecided": "too close to tell"}
 LIMITED = "deviation of 99.7 % of the points"
@@ -48,7 +49,7 @@ def judge_deviation(deviation: Deviation, sigma_mm: np.ndarray, tolerance_mm: fl
     off = np.abs(signed)
     inside, outside = off + U <= tolerance_mm, off - U > tolerance_mm
     numbers = deviation.statistics()
-    ends = [AcceptanceFigure.of_length(LIMITED, end, numbers[end], typical / 2) for end in ("p_low", "p_high")]
+    ends = [make_length_error(LIMITED, end, numbers[end], typical / 2) for end in ("p_low", "p_high")]
     decisions = [judge_property(LIMITED, [end], tolerance_mm).decision or "undecided" for end in ends]
     return ToleranceVerdict(
         tolerance_mm,

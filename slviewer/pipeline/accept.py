@@ -9,7 +9,7 @@ import numpy as np
 
 from slviewer.errors import InputError
 from slviewer.evaluation.acceptance.artefact import Artefact
-from slviewer.evaluation.acceptance.measure import SIZE, SPACING, Position, measure_artefact
+from slviewer.evaluation.acceptance.measure import SIZE, SPACING, measure_artefact
 from slviewer.evaluation.acceptance.result import Acceptance, conclude_test
 from slviewer.evaluation.repeatability import repeatability
 from slviewer.pipeline.capture_clouds import capture_cloud, check_capture_sizes
@@ -29,9 +29,15 @@ from slviewer.pipeline.open_session import match_names, next_number
 from slviewer.pipeline.operation import Found, Job, operation
 from slviewer.pipeline.reconstruct import segment_board
 from slviewer.pipeline.scale import record_scale, scale_factor
-from slviewer.records.acceptance import AcceptanceTest, Contribution, ErrorBudget
+from slviewer.records.acceptance import (
+    AcceptanceTest,
+    CertifiedArtefact,
+    Contribution,
+    ErrorBudget,
+    PositionErrors,
+    StillCaptures,
+)
 from slviewer.records.drift import Drift
-from slviewer.records.plain import from_plain, to_plain
 from slviewer.session.reading import read_toml
 from slviewer.session.store import Session
 
@@ -76,25 +82,30 @@ def accept(job: Job, settings: AcceptSettings) -> Iterator[Found[AcceptanceTest]
         repeated = repeatability(_list_depths(replace(job, progress=part(job.progress, 0.5, 0.95)), chosen, still))
     checks = load_drift_history(store)
     applied = record_scale(store, test) if settings.apply_scale else None
-    figures = to_plain(test) | {
-        "decision": test.decision,
-        "lacks": test.lacks,
-        "scale_factor": factor,
-        "scale_applied": applied,
-        "budget": to_plain(_length_budget(test, applied, checks)),
-        "repeatability": None if repeated is None else repeated.to_json(),
-        "time": datetime.now(UTC).isoformat(timespec="seconds"),
-        "inputs": store.input_hashes(f"calibration/{name}", *captures, *still),
-    }
-    yield Found(str(next_number(store, AcceptanceTest.kind)), from_plain(figures, AcceptanceTest))
+    found = AcceptanceTest(
+        artefact=CertifiedArtefact(certified.name, certified.certificate, certified.kind),
+        model=name,
+        positions=list(test.positions),
+        judgements=list(test.judgements),
+        scale=test.scale,
+        decision=test.decision,
+        lacks=list(test.lacks),
+        scale_factor=factor,
+        scale_applied=applied,
+        budget=_length_budget(test, applied, checks),
+        repeatability=None if repeated is None else StillCaptures(**repeated.to_json()),
+        time=datetime.now(UTC).isoformat(timespec="seconds"),
+        inputs=store.input_hashes(f"calibration/{name}", *captures, *still),
+    )
+    yield Found(str(next_number(store, AcceptanceTest.kind)), found)
     job.progress(1.0, "tested")
 
 
 def _measure_positions(
     job: Job, certified: Artefact, chosen: Model, captures: Mapping[str, str], end: float
-) -> list[Position]:
+) -> list[PositionErrors]:
     """Measure the artefact at each position, {capture: position}; ``end``: share of the work that is done then."""
-    store, positions = job.store, list[Position]()
+    store, positions = job.store, list[PositionErrors]()
     depth_range = load_stereo(store).depth_range_mm
     for i, (shot, frames, phases) in enumerate(decode_captures(store, list(captures), job.warn)):
         job.progress(end * i / len(captures), f"measuring {shot.name}")

@@ -24,9 +24,8 @@ from slviewer.pipeline.scan_edits import restrict_cloud
 from slviewer.pipeline.stored_records import load_record
 from slviewer.reconstruction.cloud import Cloud, choose_pixels
 from slviewer.reconstruction.reconstruct import normals
-from slviewer.records.merge import Matrix4
 from slviewer.records.placement import Placement
-from slviewer.records.plain import from_plain
+from slviewer.records.record import to_matrix
 from slviewer.registration.refusal import Refused
 from slviewer.registration.static_scene import register_object
 from slviewer.session.scan_edits import load_region
@@ -109,7 +108,7 @@ def _align_scan(job: Job, name: str, placed: Mapping[str, Placement], clouds: di
     cloud = _load_cloud(store, name, clouds, job.warn)
     inputs = store.input_hashes(name, *dict.fromkeys(("calibration/stereo", f"calibration/{cloud.model}")))
     if not placed:
-        return Placement(T_first_scan=_to_rows(np.eye(4)), inputs=inputs)
+        return Placement(T_first_scan=to_matrix(np.eye(4)), inputs=inputs)
     for onto in [*reversed(list(placed))][:MOST_TRIED]:
         pair = {onto: _load_cloud(store, onto, clouds, job.warn), name: cloud}
         try:
@@ -117,7 +116,7 @@ def _align_scan(job: Job, name: str, placed: Mapping[str, Placement], clouds: di
         except (Refused, InputError) as error:
             refusals.append(str(error))
             continue
-        T = _to_rows(np.array(placed[onto].T_first_scan) @ registered.T_reference_scan)
+        T = to_matrix(np.array(placed[onto].T_first_scan) @ registered.T_reference_scan)
         return Placement(
             T_first_scan=T,
             onto=onto,
@@ -126,11 +125,6 @@ def _align_scan(job: Job, name: str, placed: Mapping[str, Placement], clouds: di
             inputs=placed[onto].inputs | inputs,
         )
     return Placement(why=refusals[0], inputs=inputs)
-
-
-def _to_rows(T: Floats) -> Matrix4:
-    """Return a transform as plain numbers."""
-    return from_plain(T.tolist(), Matrix4)  # type: ignore[arg-type]
 
 
 def remove_placement(store: Session, name: str) -> None:

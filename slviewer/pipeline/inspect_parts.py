@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from slviewer.errors import InputError, SlviewerError, UsageError
-from slviewer.evaluation.acceptance.figures import Decision
 from slviewer.evaluation.capability import Capability, process_capability
 from slviewer.evaluation.render import Row, render
 from slviewer.inspection.parts import PartResult
@@ -17,6 +16,7 @@ from slviewer.pipeline.models import ModelName
 from slviewer.pipeline.open_session import match_names, next_number, opened
 from slviewer.pipeline.part_inspection import fail_part, inspect_part
 from slviewer.printable import format_csv
+from slviewer.records.acceptance import Decision
 from slviewer.records.plain import to_plain
 from slviewer.report.parts import write_parts_page
 from slviewer.session.atomic import replace_file, to_json

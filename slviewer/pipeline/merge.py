@@ -1,6 +1,7 @@
 """Registering scans of one object, and fusing them into one surface."""
 
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -30,7 +31,7 @@ from slviewer.pipeline.scale import describe_scale, scale_factor
 from slviewer.pipeline.scan_edits import resolve_region, restrict_cloud, restriction_notes
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.records.merge import ContradictingPair, LoopClosure, MarkerPair, Merge, RefusedPair, Registered
-from slviewer.records.plain import from_plain
+from slviewer.records.record import to_matrix, to_vector
 from slviewer.registration.markers import MeasuredMarkers, fit_marker_pose, marker_notes, measure_markers
 from slviewer.registration.multiway import MultiwayAlignment, Pair, Starts
 from slviewer.registration.pairwise import Registration
@@ -43,6 +44,7 @@ from slviewer.session.ply import write_ply
 from slviewer.session.scan_edits import restriction_inputs
 from slviewer.session.store import Session
 from slviewer.surface.fuse import Fused, fuse
+from slviewer.surface.region_of_interest import RegionOfInterest
 
 MAX_CONTRADICTION_SHARE = 0.01
 """Share of contradicting points from which on a pair is warned about: noise alone has fewer than one in a million."""
@@ -155,11 +157,19 @@ def merge(job: Job, settings: MergeSettings) -> Iterator[Found[Merge]]:
 
     Reports the uncertainty of each registered pair, how well loops close, and what was excluded, and why.
     """
-    yield merge_scans(job, settings).found
+    with _merging(job, settings) as merged:
+        yield merged.found  # and its file appears once that is stored
 
 
 def merge_scans(job: Job, settings: MergeSettings) -> MergedScans:
-    """Register and fuse scans, and write the file of the merge; the session stores nothing else."""
+    """Register and fuse scans, and write the file of the merge; nothing is stored."""
+    with _merging(job, settings) as merged:
+        return merged
+
+
+@contextmanager
+def _merging(job: Job, settings: MergeSettings) -> Iterator[MergedScans]:
+    """Context manager: registered and fused scans; the file of the merge gets its place at the end."""
     store, names, warn = job.store, settings.names, job.warn
     if settings.out is not None:
         Path(settings.out).parent.mkdir(parents=True, exist_ok=True)  # or it fails now, not after minutes
@@ -169,7 +179,8 @@ def merge_scans(job: Job, settings: MergeSettings) -> MergedScans:
     fitted = load_model(store, settings.model or preferred_model(store))
     warn_if_stale(store, warn)
     check_capture_sizes(store, names)
-    clouds = _reconstruct_scans(job, settings, fitted)
+    cuts = _list_cuts(store, settings)
+    clouds = _reconstruct_scans(job, settings, fitted, cuts)
     if settings.start == "markers":
         starts = replace(starts, markers=_measure_markers(clouds, warn))
     elif table_deg is not None:
@@ -183,57 +194,72 @@ def merge_scans(job: Job, settings: MergeSettings) -> MergedScans:
     left = {name: (each.covariance, each.centre) for name, each in alignment.uncertainties.items()}
     fused = fuse(clouds, alignment.T_reference_scan, stage(job.progress, 0.75, 0.9, "fusing"), left)
     job.progress(0.9, "writing")
-    found = _write_merge(store, settings, fitted.name, registered, fused)
+    with _write_merge(store, settings, fitted.name, registered, fused, cuts) as found:
+        yield MergedScans(alignment, fused, clouds, found)
     job.progress(1.0, "merged")
-    return MergedScans(alignment, fused, clouds, found)
 
 
-def _reconstruct_scans(job: Job, settings: MergeSettings, fitted: Model) -> dict[str, Cloud]:
+@dataclass(frozen=True)
+class _Cuts:
+    """What scans are restricted by: the region, edits and region in words, and their hashes, as inputs."""
+
+    region: RegionOfInterest | None
+    notes: tuple[str, ...]
+    inputs: Mapping[str, str]
+
+
+def _list_cuts(store: Session, settings: MergeSettings) -> _Cuts:
+    """Return what the scans are restricted by now."""
+    names, region = settings.names, resolve_region(store, settings.roi)
+    inputs = restriction_inputs(store, names, with_region=not settings.roi)
+    return _Cuts(region, restriction_notes(store, names, region), inputs)
+
+
+def _reconstruct_scans(job: Job, settings: MergeSettings, fitted: Model, cuts: _Cuts) -> dict[str, Cloud]:
     """Return the cloud of each scan without what edits and region remove."""
-    store, names, region, clouds = job.store, settings.names, resolve_region(job.store, settings.roi), {}
+    store, names, clouds = job.store, settings.names, {}
     for i, (shot, frames, phases) in enumerate(decode_captures(store, names, job.warn)):
         job.progress(0.4 * i / len(names), f"reconstructing {shot.name}")
         texture = capture_texture(shot, frames, stretch=False)
         accepted = settings.accept_rejected
         cloud = capture_cloud(store, fitted, shot, phases, texture=texture, accept_rejected=accepted, warn=job.warn)
-        clouds[shot.name] = restrict_cloud(store, shot.name, cloud, region)
+        clouds[shot.name] = restrict_cloud(store, shot.name, cloud, cuts.region)
     return clouds
 
 
+@contextmanager
 def _write_merge(
-    store: Session, settings: MergeSettings, model: str, registered: ObjectAlignment, fused: Fused
-) -> Found[Merge]:
-    """Write the surface of a merge as PLY; returns its record, which is stored unless the file has a place of its
-    own."""
-    surface, names, scale = fused.surface, settings.names, describe_scale(store, model)
-    restrictions = restriction_notes(store, names, resolve_region(store, settings.roi))
+    store: Session, settings: MergeSettings, model: str, registered: ObjectAlignment, fused: Fused, cuts: _Cuts
+) -> Iterator[Found[Merge]]:
+    """Context manager: the record of a merge, to be stored unless its PLY has a place of its own, which it gets at the
+    end."""
+    surface = fused.surface
     scalars = {} if surface.sigma_mm is None else {"sigma": surface.sigma_mm}
     scalars |= {"seen_by": fused.seen_by, "source": fused.source}
     frame = f"{frame_of(store, model)}, at {settings.reference}"
-    notes = (f"scans {', '.join(names)}, frame: {frame}", f"calibration {model}", *restrictions)
+    notes = (f"scans {', '.join(settings.names)}, frame: {frame}", f"calibration {model}", *cuts.notes)
     number = next_number(store, "merge") if settings.out is None else 0
     with placed_file(store, settings.out, f"merged_{number}.ply") as (path, written):
         write_ply(written, surface.points, surface.colours, surface.normals, scalars, notes=notes)
-    calibrations = dict.fromkeys(("calibration/stereo", f"calibration/{model}"))
-    cuts = restriction_inputs(store, names, with_region=not settings.roi)
-    record = _make_record(
-        registered,
-        fused,
-        ply=path.name,
-        model=model,
-        scale=scale,
-        restrictions=list(restrictions),
-        scales={model: scale_factor(store, model)},
-        inputs={**store.input_hashes(*fused.names, *calibrations), **cuts},
-    )
-    r1, r2 = letter.EXPERIMENT_3_ICP_RMS_MM.values()
-    said = [
-        f"(The Letter's three depths: point to point {r1:.2f} and {r2:.2f} mm.)",
-        f"{record.points:,} points -> {path}",
-    ]
-    if number:
-        said.append(f"the session stores it as merge/{number}: mesh, compare and measure accept that name")
-    return Found(str(number or path.stem), record, {}, (path,), tuple(said), stored=bool(number))
+        calibrations = dict.fromkeys(("calibration/stereo", f"calibration/{model}"))
+        record = _make_record(
+            registered,
+            fused,
+            ply=path.name,
+            model=model,
+            scale=describe_scale(store, model),
+            restrictions=list(cuts.notes),
+            scales={model: scale_factor(store, model)},
+            inputs={**store.input_hashes(*fused.names, *calibrations), **cuts.inputs},
+        )
+        r1, r2 = letter.EXPERIMENT_3_ICP_RMS_MM.values()
+        said = [
+            f"(The Letter's three depths: point to point {r1:.2f} and {r2:.2f} mm.)",
+            f"{record.points:,} points -> {path}",
+        ]
+        if number:
+            said.append(f"the session stores it as merge/{number}: mesh, compare and measure accept that name")
+        yield Found(str(number or path.stem), record, {}, (path,), tuple(said), stored=bool(number))
 
 
 def _measure_markers(clouds: Mapping[str, Cloud], warn: Warn) -> dict[str, MeasuredMarkers]:
@@ -351,23 +377,20 @@ def _make_record(registered: ObjectAlignment, fused: Fused, **origin: Any) -> Me
 def _make_registered(scan: str, onto: str, registration: Registration) -> Registered:
     """Return the figures of a registration."""
     uncertainty = registration.uncertainty
-    return from_plain(
-        {
-            "scan": scan,
-            "onto": onto,
-            "rms_mm": registration.rms_mm,
-            "point_to_point_rms_mm": registration.inlier_rmse_mm,
-            "overlap": registration.overlap,
-            "agreement": registration.agreement,
-            "slack_mm": registration.slack_mm,
-            "gate_mm": registration.gate_mm,
-            "start": registration.start,
-            "sigma_shift_mm": uncertainty.shift_mm,
-            "sigma_turn_deg": uncertainty.turn_deg,
-            "middle": uncertainty.centre.tolist(),
-            "T_reference_scan": registration.T_reference_scan.tolist(),
-        },
-        Registered,
+    return Registered(
+        scan=scan,
+        onto=onto,
+        rms_mm=registration.rms_mm,
+        point_to_point_rms_mm=registration.inlier_rmse_mm,
+        overlap=registration.overlap,
+        agreement=registration.agreement,
+        slack_mm=registration.slack_mm,
+        gate_mm=registration.gate_mm,
+        start=registration.start,
+        sigma_shift_mm=uncertainty.shift_mm,
+        sigma_turn_deg=uncertainty.turn_deg,
+        middle=to_vector(uncertainty.centre),
+        T_reference_scan=to_matrix(registration.T_reference_scan),
     )
 
 

@@ -1,11 +1,12 @@
 """Operations: what computes records. One runner opens the session, runs one, stores what it finds, and returns that."""
 
 import inspect
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping
+from contextlib import closing
 from dataclasses import dataclass, field, fields, replace
 from functools import partial, update_wrapper
 from pathlib import Path
-from typing import Any, Generic, ParamSpec, TypeVar
+from typing import Any, Generic, ParamSpec, TypeVar, cast
 
 import msgspec
 import numpy as np
@@ -34,8 +35,8 @@ class Job:
 
 @dataclass(frozen=True, eq=False)
 class Found(Generic[R]):
-    """One record that an operation found, and its arrays. ``name``: the capture that it is of, or its number; empty
-    where ``stored`` is false, a name for the file alone. ``files``: what else was written, ``notes`` on it in words.
+    """One record that an operation found, and its arrays. ``name``: the capture that it is of, or its number; where it
+    is not to be ``stored``, that of its file. ``files``: what else was written, ``notes`` on it in words.
     """
 
     name: str
@@ -131,26 +132,23 @@ class Operation(Generic[P, S, R]):
 
     def find(self, job: Job, settings: S) -> Iterator[Found[Any]]:
         """Yield everything that the operation finds, of any kind, once it is stored."""
-        for found in self.function(job, settings):
-            record = found.record
-            if not record.operation:
-                record = msgspec.structs.replace(record, operation=self.name, settings=plain_settings(settings))
-            if found.stored and job.store.is_writable:
-                save_record(job.store, found.name, record, found.arrays)
-            yield replace(found, record=record)
+        everything = cast("Generator[Found[Any], None, None]", self.function(job, settings))
+        with closing(everything):  # a file that it is about to place is given up where saving fails
+            for found in everything:
+                record = found.record
+                if not record.operation:
+                    record = msgspec.structs.replace(record, operation=self.name, settings=plain_settings(settings))
+                if found.stored and job.store.is_writable:
+                    save_record(job.store, found.name, record, found.arrays)
+                yield replace(found, record=record)
 
 
 def plain_settings(settings: Any) -> dict[str, Any]:
     """Return the settings that are not the default as plain values, but those that its ``UNRECORDED`` names, which do
     not influence what is found."""
-    left, chosen = (
-        getattr(settings, "UNRECORDED", ()),
-        {each.name: getattr(settings, each.name) for each in fields(settings)},
-    )
-    defaults = {each.name: each.default for each in fields(settings)}
-    return to_plain(  # type: ignore[no-any-return]
-        {name: value for name, value in chosen.items() if name not in left and value != defaults[name]}
-    )
+    kept = [each for each in fields(settings) if each.name not in getattr(settings, "UNRECORDED", ())]
+    values = {each.name: getattr(settings, each.name) for each in kept}
+    return to_plain({each.name: values[each.name] for each in kept if values[each.name] != each.default})  # type: ignore[no-any-return]
 
 
 OPERATIONS: dict[str, Operation[Any, Any, Any]] = {}

@@ -1,6 +1,7 @@
 """From a capture to a cloud."""
 
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
@@ -104,16 +105,23 @@ class ReconstructSettings:
 def reconstruct(job: Job, settings: ReconstructSettings) -> Iterator[Found[Reconstruction]]:
     """Reconstruct a capture as a cloud, and write it as PLY; for a board pose also how flat each model measures the
     board."""
-    made = reconstruct_capture(job, settings)
-    notes = (*made.restrictions, f"{made.points:,} points -> {made.ply}")
-    if made.board is not None:
-        tables = Verification.tables({settings.capture: made.board.record()})
-        notes += ("inside the board's outline:", *map(render_text, tables))
-    yield replace(made.found, files=(made.ply,), notes=notes)
+    with _reconstructing(job, settings) as made:  # whose file appears once the record is stored
+        notes = (*made.restrictions, f"{made.points:,} points -> {made.ply}")
+        if made.board is not None:
+            tables = Verification.tables({settings.capture: made.board.record()})
+            notes += ("inside the board's outline:", *map(render_text, tables))
+        yield replace(made.found, files=(made.ply,), notes=notes)
 
 
 def reconstruct_capture(job: Job, settings: ReconstructSettings) -> ReconstructedCapture:
     """Reconstruct a capture, and write its file; nothing is stored."""
+    with _reconstructing(job, settings) as made:
+        return made
+
+
+@contextmanager
+def _reconstructing(job: Job, settings: ReconstructSettings) -> Iterator[ReconstructedCapture]:
+    """Context manager: a reconstructed capture; its file gets its place at the end."""
     store, capture, warn = job.store, settings.capture, job.warn
     check_accepted(store, settings.accept_rejected)
     name = settings.model or preferred_model(store)
@@ -143,16 +151,18 @@ def reconstruct_capture(job: Job, settings: ReconstructSettings) -> Reconstructe
             "projector, and is the scene within its depths?"
         )
     job.progress(0.8, "writing")
-    path = _write_files(store, settings, cloud, mask, (f"calibration {name}", *restrictions))
     found = cloud_record(store, settings, chosen[name], clouds[name], phases[cloud.axis], region)
+    with _write_files(store, settings, cloud, mask, (f"calibration {name}", *restrictions)) as path:
+        yield ReconstructedCapture(found, cloud, phases, path, int(np.count_nonzero(mask)), board, restrictions)
     job.progress(1.0, "reconstructed")
-    return ReconstructedCapture(found, cloud, phases, path, int(np.count_nonzero(mask)), board, restrictions)
 
 
+@contextmanager
 def _write_files(
     store: Session, settings: ReconstructSettings, cloud: Cloud, mask: np.ndarray, notes: Sequence[str]
-) -> Path:
-    """Write a cloud's points under ``mask`` (h, w) bool as PLY, and its grid where that is wanted; returns the path."""
+) -> Iterator[Path]:
+    """Context manager: the path of a PLY of a cloud's points under ``mask`` (h, w) bool, which appears there at the
+    end; the cloud's grid is written too where that is wanted."""
     capture, points = settings.capture, cloud.points
     assert cloud.texture is not None
     faces = triangulate_points(points, mask) if settings.mesh else None
@@ -163,7 +173,7 @@ def _write_files(
         write_ply(written, chosen, cloud.texture[mask], normals(points)[mask], cloud.sigmas(mask), faces, notes)
         if settings.grid is not None:
             write_grid(Path(settings.grid), points)
-    return path
+        yield path
 
 
 def cloud_record(

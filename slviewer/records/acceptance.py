@@ -6,9 +6,8 @@ from typing import Any, ClassVar, Literal
 
 import msgspec
 
-from slviewer.records.record import Record
+from slviewer.records.record import Count, Record
 from slviewer.records.table import Cell, Column, Mark, Table, Value
-from slviewer.records.verification import Count
 
 Decision = Literal["pass", "fail", "undecided"]
 Interval = tuple[float, float]
@@ -44,25 +43,51 @@ class JudgedProperty(msgspec.Struct, frozen=True):
 
 
 class PositionErrors(msgspec.Struct, frozen=True):
-    """What was measured at one position: ``rms_mm`` and ``floor_mm`` of each ball or the plane."""
+    """What was measured at one position: ``rms_mm`` and ``floor_mm`` of each ball or the plane, RMS of the points'
+    deviations and what noise alone would leave; ``noise_mm``: standard uncertainty of a length by the cloud's noise
+    alone; ``incidence``: percent in R1, R2, R3; ``warnings``: what was excluded."""
 
     position: str
     capture: str
     figures: list[PropertyError]
     rms_mm: list[float]
-    floor_mm: list[float]
+    floor_mm: list[float | None]
     points: Count
+    noise_mm: float = 0.0
     incidence: dict[str, float] | None = None
     warnings: list[str] = []
 
+    @property
+    def properties(self) -> set[str]:
+        """Names of the properties that were measured here."""
+        return {figure.property for figure in self.figures}
+
+    def error(self, name: str) -> PropertyError:
+        """Return the worst figure of a property at this position."""
+        return max((f for f in self.figures if f.property == name), key=lambda f: abs(f.error_mm))
+
 
 class ScaleError(msgspec.Struct, frozen=True):
-    """Relative error of the scale, positive where the instrument measures too long, from so many positions."""
+    """Relative error of the scale, positive where the instrument measures too long; ``u_ppm`` is its standard
+    uncertainty.
+
+    From the errors of one length at several positions: their mean, with the scatter between positions (widened for
+    their number by Student's t) and what all of them share, the certificate and the temperature.
+    """
 
     ppm: float
     u_ppm: float
     length_mm: float
     positions: Count
+
+    @property
+    def U_ppm(self) -> float:
+        """Expanded uncertainty of the scale, k = 2."""
+        return COVERAGE * self.u_ppm
+
+    def within(self, k: float) -> Interval:
+        """Return the interval of k standard uncertainties, ppm."""
+        return self.ppm - k * self.u_ppm, self.ppm + k * self.u_ppm
 
 
 class Contribution(msgspec.Struct, frozen=True):
@@ -219,18 +244,18 @@ class AcceptanceTest(Record, frozen=True, kw_only=True):
         ]
         rows: list[list[Value | Cell]] = []
         for each in self.positions:
-            worst = {f.property: f.error_mm for f in sorted(each.figures, key=lambda f: abs(f.error_mm))}
             shares = [(each.incidence or {}).get(depths) for depths in ("R1", "R2", "R3")]
-            errors = [worst.get(name) for name in shown]
-            rows.append([each.position, *errors, max(each.rms_mm), max(each.floor_mm), *shares, each.points])
+            errors = [each.error(name).error_mm if name in each.properties else None for name in shown]
+            floor = max((mm for mm in each.floor_mm if mm is not None), default=None)
+            rows.append([each.position, *errors, max(each.rms_mm), floor, *shares, each.points])
         notes = [f"{each.position}: {warning}" for each in self.positions for warning in each.warnings]
         return Table(columns, rows, "The worst error of each property at each position", notes).without_empty()
 
     def _list_notes(self) -> list[str]:
         notes = [f"{self.summary()}.", f"{len(self.positions)} positions.", RULE]
         if self.scale is not None:
-            scale, U = self.scale, COVERAGE * self.scale.u_ppm
-            notes.append(f"Scale: {scale.ppm:+.0f} ppm ± {U:.0f} ppm (k = 2) over {scale.length_mm:.3f} mm.")
+            scale = self.scale
+            notes.append(f"Scale: {scale.ppm:+.0f} ppm ± {scale.U_ppm:.0f} ppm (k = 2) over {scale.length_mm:.3f} mm.")
         if self.scale_applied is not None:
             notes.append(f"The scale was corrected by {1e6 * (self.scale_applied - 1):+.0f} ppm from this test on.")
         elif self.scale_factor != 1:
@@ -242,6 +267,6 @@ class AcceptanceTest(Record, frozen=True, kw_only=True):
             notes.append(
                 f"Repeatability over {still.captures} captures of a still object: {still.sigma_mm:.4f} mm (median over "
                 f"{still.pixels:,} pixels; 95 % below {still.sigma_95_mm:.4f}), {still.predicted_mm:.4f} mm expected "
-                f"from noise; the mean depth drifted by {still.wandering_mm:.4f} mm. This is no measure of accuracy."
+                f"from noise; the mean depth drifted by {still.wandering_mm:.4f} mm. This is not a measure of accuracy."
             )
         return [note.replace(" -", " −").replace("−-apply", "--apply") for note in notes]

@@ -3,9 +3,8 @@
 from collections.abc import Mapping
 from typing import Any, ClassVar, Literal
 
-from slviewer.records.record import Record
+from slviewer.records.record import Record, Vector
 from slviewer.records.table import Cell, Column, Table, Value
-from slviewer.records.verification import Vector
 
 DriftVerdict = Literal["still good", "recalibrate"]
 

@@ -7,12 +7,9 @@ from typing import Any, ClassVar
 
 import msgspec
 
-from slviewer.records.record import Record
+from slviewer.records.record import Count, Matrix4, Record, Vector
 from slviewer.records.table import Cell, Column, Table, Value
-from slviewer.records.verification import Count, Vector
 
-Row4 = tuple[float, float, float, float]
-Matrix4 = tuple[Row4, Row4, Row4, Row4]
 MIN_OVERLAP = 0.3
 """Share of a scan below which its overlap with another is reported."""
 EXCLUDED = {

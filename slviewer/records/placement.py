@@ -1,15 +1,10 @@
 """Where scans of one object are, beside those that were captured before."""
 
 from collections.abc import Mapping
-from typing import Annotated, ClassVar
+from typing import ClassVar
 
-import msgspec
-
-from slviewer.records.merge import Matrix4
-from slviewer.records.record import Record
+from slviewer.records.record import Matrix4, Record, Share
 from slviewer.records.table import Cell, Column, Table, Value
-
-Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
 
 
 class Placement(Record, frozen=True, kw_only=True):

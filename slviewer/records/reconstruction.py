@@ -3,9 +3,8 @@
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
-from slviewer.records.record import Record
+from slviewer.records.record import Count, Record
 from slviewer.records.table import Cell, Column, Table, Value
-from slviewer.records.verification import Count
 
 REPORTED_RAISE = 1.2
 """Times its predicted noise that a calibration's residual is, from which raising sigma is reported."""
@@ -59,7 +58,7 @@ class Reconstruction(Record, frozen=True, kw_only=True):
         columns = [
             Column("capture", align="left"),
             Column("model", align="left"),
-            Column("axis", align="centre"),
+            Column("axis", align="centre", detail=True),
             Column("points"),
             Column("nearest", "mm", digits=0),
             Column("farthest", "mm", digits=0),

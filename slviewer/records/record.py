@@ -2,11 +2,12 @@
 
 import re
 from collections.abc import Iterator, Mapping
-from typing import Any, ClassVar, TypeVar
+from typing import Annotated, Any, ClassVar
 
 import msgspec
+import numpy as np
 
-from slviewer.records.plain import to_plain
+from slviewer.records.plain import from_plain, to_plain
 from slviewer.records.table import Column, Table, Value
 
 RECORDS: dict[str, type["Record"]] = {}
@@ -16,7 +17,22 @@ UNITS = {
     "rad": ("rad", 4), "percent": ("%", 1), "ppm": ("ppm", 1), "s": ("s", 1), "ms": ("ms", 1),
 }  # fmt: skip
 """{last word of a figure's name: (unit, decimals)}."""
-R = TypeVar("R", bound="Record")
+Count = Annotated[int, msgspec.Meta(ge=0)]
+Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
+Vector = tuple[float, float, float]
+Row4 = tuple[float, float, float, float]
+Matrix4 = tuple[Row4, Row4, Row4, Row4]
+
+
+def to_vector(values: np.ndarray) -> Vector:
+    """Return an array (3,) as plain numbers."""
+    x, y, z = map(float, values)
+    return x, y, z
+
+
+def to_matrix(T: np.ndarray) -> Matrix4:
+    """Return a transform (4, 4) as plain numbers."""
+    return from_plain(np.asarray(T, np.float64).tolist(), Matrix4)  # type: ignore[arg-type]
 
 
 class Record(msgspec.Struct, frozen=True, kw_only=True):
@@ -49,7 +65,7 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     def tables(cls, found: Mapping[str, "Record"]) -> list[Table]:
         """Return the tables of some records of this kind, by the name of each: by default a line each, and a column for
         every figure."""
-        figures = {name: {f: v for f, v in record.figures().items()} for name, record in found.items()}
+        figures = {name: record.figures() for name, record in found.items()}
         names = list(dict.fromkeys(figure for each in figures.values() for figure in each))
         rows: list[list[Value]] = [[name, *(each.get(f) for f in names)] for name, each in figures.items()]
         return [Table([Column("name", align="left"), *map(figure_column, names)], rows, cls.title)]
@@ -61,8 +77,8 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
 
     def summary(self) -> str:
         """Return the figures in one sentence."""
-        columns = {name: figure_column(name) for name in self.figures()}
-        return ", ".join(f"{c.title} {c.format(self.figures()[n])} {c.unit}".strip() for n, c in columns.items())
+        columns = [(figure_column(name), value) for name, value in self.figures().items()]
+        return ", ".join(f"{column.title} {column.format(value)} {column.unit}".strip() for column, value in columns)
 
     def figures(self) -> dict[str, float]:
         """Return the numbers of the record by name; of those inside others ``name of the outer, of the inner``."""

@@ -146,19 +146,26 @@ def render_text(table: Table) -> str:
 
     Titles stand above their columns one word a line, so that wide tables stay narrow.
     """
-    head = [column.heading.split() for column in table.columns]
-    height = max(map(len, head), default=0)
-    lines = [list(line) for line in zip(*([""] * (height - len(words)) + words for words in head), strict=True)]
     body = [[text for _, text, _ in line] for line in table.format([*table.rows, *table.footer])]
-    widths = [max(map(len, cells)) for cells in zip(*lines, *body, strict=True)]
+    is_left = [column.align == "left" for column in table.columns]
+    lines = align_columns([column.heading for column in table.columns], body, is_left, len(table.footer))
+    return "\n".join([*lines, *table.notes])
+
+
+def align_columns(
+    headings: Sequence[str], body: Sequence[Sequence[str]], is_left: Sequence[bool], footers: int = 0
+) -> list[str]:
+    """Return lines of texts in columns, below headings of one word a line, and a rule above the last ``footers``."""
+    words = [heading.split() for heading in headings]
+    height = max(map(len, words), default=0)
+    head = list(zip(*([""] * (height - len(each)) + each for each in words), strict=True))
+    widths = [max(map(len, cells)) for cells in zip(*head, *body, strict=True)]
 
     def align(line: Sequence[str]) -> str:
         """Return the cells of a line side by side."""
-        cells = zip(table.columns, line, widths, strict=True)
-        return "  ".join(t.ljust(w) if c.align == "left" else t.rjust(w) for c, t, w in cells).rstrip()
+        cells = zip(line, widths, is_left, strict=True)
+        return "  ".join(text.ljust(width) if left else text.rjust(width) for text, width, left in cells).rstrip()
 
     rule = "-" * (sum(widths) + 2 * max(0, len(widths) - 1))
-    text = [*map(align, lines), rule, *map(align, body)]
-    if table.footer:
-        text.insert(-len(table.footer), rule)
-    return "\n".join([*text, *table.notes])
+    lines = [*map(align, head), rule, *map(align, body)]
+    return [*lines[: len(lines) - footers], rule, *lines[len(lines) - footers :]] if footers else lines

@@ -7,12 +7,10 @@ from typing import Annotated, Any, ClassVar, Literal
 
 import msgspec
 
-from slviewer.records.record import Record
+from slviewer.records.record import Count, Record, Vector
 from slviewer.records.table import Cell, Column, Table, Value, compare_errors
 
 Shape = Literal["plane", "sphere"]
-Count = Annotated[int, msgspec.Meta(ge=0)]
-Vector = tuple[float, float, float]
 MAX_EXCLUDED = 0.02
 """Share of points excluded above which the RMS does not describe the shape."""
 REPORTED_MASKED = 0.005

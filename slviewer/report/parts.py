@@ -5,10 +5,10 @@ from pathlib import Path
 
 import numpy as np
 
-from slviewer.evaluation.acceptance.figures import Decision
 from slviewer.evaluation.capability import Capability
 from slviewer.evaluation.render import format_count
 from slviewer.inspection.parts import CharacteristicResult, PartResult
+from slviewer.records.acceptance import Decision
 from slviewer.records.table import Cell, Column, Mark, Table
 from slviewer.report.canvas import HALF, INK, SOFT, finish_figure, new_figure, style_axes
 from slviewer.report.page import Figure, Headline, PageNotice, Section, write_page

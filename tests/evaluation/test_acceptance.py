@@ -13,7 +13,7 @@ from facts import missing_facts, raises
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import InputError
 from slviewer.evaluation.acceptance.artefact import Artefact, Limits
-from slviewer.evaluation.acceptance.figures import K_95, AcceptanceFigure, decide, narrowest_range
+from slviewer.evaluation.acceptance.figures import K_95, decide, make_length_error, narrowest_range
 from slviewer.evaluation.acceptance.measure import FLATNESS, FORM, SIZE, SPACING, measure_artefact
 from slviewer.evaluation.acceptance.result import conclude_test
 from slviewer.evaluation.repeatability import repeatability
@@ -136,7 +136,7 @@ def test_decisions_heed_the_tests_own_uncertainty(true_test, limit, decision):
         unsure = true_test.artefact
     errors = [0.005, -0.003, 0.001]
     u = unsure.at_measurement(unsure.spacing)[1]
-    assert decide([AcceptanceFigure.of_length(SPACING, "", error, u) for error in errors], limit) == decision
+    assert decide([make_length_error(SPACING, "", error, u) for error in errors], limit) == decision
     judged = conclude_test(replace(unsure, limits=Limits(spacing_mm=limit)), "stereo", true_test.positions)
     assert judged.decision in ("pass", "fail", "undecided")
 

@@ -24,7 +24,7 @@ def test_the_plane_and_its_noise_are_found_in_a_whole_cloud() -> None:
     assert np.degrees(np.arccos(result.plane.normal @ truth)) < 0.01
     assert result.points > 0.95 * board.sum()
     assert not np.isfinite(result.error_map[~board]).any()
-    assert result.set_aside < 1e-4 * result.points
+    assert result.excluded < 1e-4 * result.points
     expected = along_normal(np.where(board[..., None], points, np.nan), truth, SIGMA)
     assert result.rms_mm == pytest.approx(expected, rel=0.02)
     assert result.noise_floor_mm == pytest.approx(result.rms_mm, rel=0.02)
@@ -52,7 +52,7 @@ def test_stray_points_are_set_aside_and_counted() -> None:
     stray = inner[rng.choice(len(inner), 500, replace=False)]
     points[stray[:, 0], stray[:, 1]] *= rng.uniform(1.005, 1.2, (500, 1)).astype(np.float32)
     result = evaluate_plane(points, None)
-    assert 495 <= result.set_aside <= 510
+    assert 495 <= result.excluded <= 510
     assert 0.045 < result.rms_mm < 0.052
     assert not result.inliers[stray[:, 0], stray[:, 1]].any()
     assert np.isfinite(result.error_map[stray[:, 0], stray[:, 1]]).mean() > 0.99
@@ -81,7 +81,7 @@ def test_a_bow_of_half_a_millimetre_is_not_flattened() -> None:
     bow = 0.5 * (1.0 - (x / np.abs(x).max()) ** 2)
     result = evaluate_plane(cloud(plane_depth() - bow, 0.02), None)
     inner = bow[2:-2, 2:-2]
-    assert result.set_aside == 0
+    assert result.excluded == 0
     assert result.rms_mm == pytest.approx(np.std(inner) * 0.976, rel=0.06)  # 0.976: the plane's slant
 
 
@@ -115,7 +115,7 @@ def test_a_masked_region_full_of_strays_is_still_measured() -> None:
     points[30:120, 60:200] *= 1.1  # a fifth of the mask shows something else
     result = evaluate_plane(points, board)
     assert 0.045 < result.rms_mm < 0.052
-    assert 0.15 < result.set_aside_share < 0.25
+    assert 0.15 < result.excluded_share < 0.25
     assert result.warning is not None
 
 

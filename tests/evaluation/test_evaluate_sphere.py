@@ -42,7 +42,7 @@ def test_a_dent_in_form_is_not_set_aside() -> None:
     points = cloud(front, 0.01)
     points[..., 0] = CENTRE[0] + (points[..., 0] - CENTRE[0]) * (1 - 0.5 / RADIUS)
     result = evaluate_sphere(points, None)
-    assert result.set_aside_share < 0.001
+    assert result.excluded_share < 0.001
     assert 0.05 < result.rms_mm < 0.3
 
 

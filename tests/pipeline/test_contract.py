@@ -12,7 +12,8 @@ from clocks import HANG_S
 
 import slviewer as sl
 from slviewer.cli import main
-from slviewer.pipeline import operations
+from slviewer.errors import SessionError
+from slviewer.pipeline import operation, operations
 from slviewer.pipeline.certificate import make_certificate
 from slviewer.pipeline.reconstruct import ReconstructSettings
 from slviewer.session.store import Session
@@ -202,6 +203,21 @@ def test_a_session_in_use_is_read_and_the_result_is_not_stored(recorded: Path, t
         assert store.state_of("clouds/object_r1") == "absent"
     (warning,) = warnings
     assert "not stored" in warning and str(session) in warning
+
+
+@pytest.mark.parametrize("name", ["reconstruct", "merge"])
+def test_no_file_appears_whose_record_could_not_be_stored(
+    name: str, recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    session = shutil.copytree(recorded / "session", tmp_path / "session")
+
+    def refuse(*_: object) -> None:
+        raise SessionError("the disk is full")
+
+    monkeypatch.setattr(operation, "save_record", refuse)
+    with pytest.raises(SessionError):
+        OPERATIONS[name].python(session)
+    assert not list((session / "exports").glob("*")) and not list((session / "results").glob("m*"))
 
 
 def test_every_operation_is_bound_by_the_contract() -> None:

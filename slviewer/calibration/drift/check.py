@@ -17,7 +17,7 @@ from slviewer.errors import InputError
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.vectors import rms, unit_vectors
 from slviewer.records.drift import Drift
-from slviewer.records.verification import Vector
+from slviewer.records.record import to_vector
 
 FALSE_ALARMS = 1e-4
 """False-alarm probability of one check; a check precedes every day's work."""
@@ -82,10 +82,10 @@ def check_drift(reference: DriftReference, view: DriftView) -> Drift:
         axes=view.axes,
         verdict="recalibrate" if reasons else "still good",
         reasons=tuple(reasons),
-        turn_mrad=_to_vector(1e3 * estimate.change[:3]),
-        turn_sigma_mrad=_to_vector(1e3 * sigmas[:3]),
-        shift_mm=_to_vector(estimate.change[3:]),
-        shift_sigma_mm=_to_vector(sigmas[3:]),
+        turn_mrad=to_vector(1e3 * estimate.change[:3]),
+        turn_sigma_mrad=to_vector(1e3 * sigmas[:3]),
+        shift_mm=to_vector(estimate.change[3:]),
+        shift_sigma_mm=to_vector(sigmas[3:]),
         baseline_mm=float(along @ estimate.change),
         baseline_sigma_mm=float(np.sqrt(along @ C @ along)),
         scale_ppm=1e6 * estimate.scale,
@@ -94,7 +94,7 @@ def check_drift(reference: DriftReference, view: DriftView) -> Drift:
         across_sigma_px=across_sigma,
         misfit_px=estimate.misfit_px,
         chance=chance,
-        seen_alone=(*_to_vector(seen_alone[:3]), *_to_vector(seen_alone[3:])),
+        seen_alone=(*to_vector(seen_alone[:3]), *to_vector(seen_alone[3:])),
         unseen=(*_list_undetermined(seen_alone, view.axes), "common motion of both devices (harmless)"),
     )
 
@@ -133,9 +133,3 @@ def _list_undetermined(seen_alone: np.ndarray, axes: Sequence[Axis]) -> list[str
             )
             undetermined.append(f"a {move} of less than {size}: {why}")
     return undetermined
-
-
-def _to_vector(values: np.ndarray) -> Vector:
-    """Convert an array (3,) to plain numbers."""
-    x, y, z = map(float, values)
-    return x, y, z

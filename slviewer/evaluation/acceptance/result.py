@@ -8,36 +8,13 @@ from scipy.special import stdtrit
 
 from slviewer.errors import InputError
 from slviewer.evaluation.acceptance.artefact import Artefact
-from slviewer.evaluation.acceptance.figures import K_95, Decision, Judgement, judge_property
-from slviewer.evaluation.acceptance.measure import FLATNESS, FORM, SIZE, SPACING, Position
+from slviewer.evaluation.acceptance.figures import K_95, judge_property
+from slviewer.evaluation.acceptance.measure import FLATNESS, FORM, SIZE, SPACING
+from slviewer.records.acceptance import Decision, JudgedProperty, PositionErrors, ScaleError
 
 POSITIONS = {"ball-bar": 7, "sphere": 7, "plane": 6}
 OUTSIDE = 50.0
 """Percent of an artefact's points in R1 (R3) from which on it stands there."""
-
-
-@dataclass(frozen=True)
-class ScaleEstimate:
-    """Relative scale error of the instrument, ppm, positive where it measures too long; ``u_ppm`` is its standard
-    uncertainty.
-
-    From the errors of one length at several positions: their mean, with the scatter between positions (widened for
-    their number by Student's t) and what all of them share, the certificate and the temperature.
-    """
-
-    ppm: float
-    u_ppm: float
-    length_mm: float
-    positions: int
-
-    @property
-    def U_ppm(self) -> float:
-        """Expanded uncertainty of the scale in ppm, k = 2."""
-        return 2 * self.u_ppm
-
-    def within(self, k: float) -> tuple[float, float]:
-        """The interval of k standard uncertainties, ppm."""
-        return self.ppm - k * self.u_ppm, self.ppm + k * self.u_ppm
 
 
 @dataclass(frozen=True)
@@ -46,9 +23,9 @@ class Acceptance:
 
     artefact: Artefact
     model: str
-    positions: tuple[Position, ...]
-    judgements: tuple[Judgement, ...]
-    scale: ScaleEstimate | None
+    positions: tuple[PositionErrors, ...]
+    judgements: tuple[JudgedProperty, ...]
+    scale: ScaleError | None
 
     @property
     def decision(self) -> Decision | None:
@@ -73,7 +50,7 @@ class Acceptance:
         return tuple(gaps)
 
 
-def conclude_test(artefact: Artefact, model: str, positions: Sequence[Position]) -> Acceptance:
+def conclude_test(artefact: Artefact, model: str, positions: Sequence[PositionErrors]) -> Acceptance:
     """The test's result from its positions. Raises InputError where there is none."""
     if not positions:
         raise InputError(f"no capture shows {artefact.name}: name some in [measured] captures of its file")
@@ -85,7 +62,7 @@ def conclude_test(artefact: Artefact, model: str, positions: Sequence[Position])
     return Acceptance(artefact, model, tuple(positions), judgements, _estimate_scale(artefact, positions))
 
 
-def _estimate_scale(artefact: Artefact, positions: Sequence[Position]) -> ScaleEstimate | None:
+def _estimate_scale(artefact: Artefact, positions: Sequence[PositionErrors]) -> ScaleError | None:
     """Estimate the scale by the spacing of a ball bar's centres, by a sphere's diameter; None for a plane."""
     length = artefact.spacing or (artefact.diameters[0] if artefact.diameters else None)
     if length is None:
@@ -96,4 +73,4 @@ def _estimate_scale(artefact: Artefact, positions: Sequence[Position]) -> ScaleE
     n = len(errors)
     per_deviation = stdtrit(n - 1, 0.975) / K_95 / np.sqrt(n)
     u_mean = float(errors.std(ddof=1) * per_deviation) if n > 1 else positions[0].noise_mm
-    return ScaleEstimate(1e6 * float(errors.mean()) / mm, 1e6 * float(np.hypot(u_mean, u_shared)) / mm, mm, n)
+    return ScaleError(1e6 * float(errors.mean()) / mm, 1e6 * float(np.hypot(u_mean, u_shared)) / mm, mm, n)
