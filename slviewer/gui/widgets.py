@@ -19,7 +19,7 @@ import viser
 from numpy.typing import NDArray
 
 from slviewer.errors import hide_passwords
-from slviewer.pipeline.stored_records import Stored
+from slviewer.pipeline.stored_records import Stored, name_records
 from slviewer.records.table import Mark, Table
 from slviewer.server.text import escape
 
@@ -128,8 +128,9 @@ def records_html(
     those that are stale. Not ``named``: of one record, whose name stands above."""
     if not found:
         return Html("")
-    kind, shown = type(found[0].record), {each.label: each.record for each in found}
-    tables = [relabel(each, labels) for each in kind.tables(shown)]
+    tables = type(found[0].record).tables(name_records(found))
+    if found[0].name.isdecimal():  # captures are named inside
+        tables = [relabel(each, labels) for each in tables]
     if not named:
         tables = [replace(each.without_constant(), caption="") for each in tables]
     html = "".join(map(report_table, tables))

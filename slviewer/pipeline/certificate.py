@@ -351,20 +351,20 @@ def _run_again(
         kind, _, name = result.partition("/")
         if kind not in RECORDS:
             continue
-        record = load_record(store, RECORDS[kind], name)
-        if record.operation in OPERATIONS:
+        with _note_failure(why, result):
+            record = load_record(store, RECORDS[kind], name)
+            if record.operation not in OPERATIONS:
+                raise InputError("an older version of slviewer made it: make it again, and write the report again")
             runs.setdefault((record.operation, to_json(record.settings)), []).append(result)
-        else:
-            why[result] = "an older version of slviewer made it: make it again, and write the report again"
     figures: Figures = {}
     for k, ((name, settings), results) in enumerate(runs.items()):
         progress(0.6 + 0.2 * k / len(runs), f"repeating {name}")
         operation = OPERATIONS[name]
-        with _note_failure(why, *results):
-            found = list(operation.find(Job(fresh), operation.settings(**msgspec.json.decode(settings))))
-            made = {f"{each.record.kind}/{each.name}": each.record.figures() for each in found}
-            is_numbered = len(found) == 1 and found[0].name.isdecimal()  # its number here may be another
-            figures |= dict.fromkeys(results, found[0].record.figures()) if is_numbered else made
+        with _note_failure(why, *results), Session.open(fresh.folder) as reading:  # nothing needs to be stored
+            for found in operation.find(Job(reading), operation.settings(**msgspec.json.decode(settings))):
+                # a number here may be another than that of before
+                names = results if found.name.isdecimal() else [f"{found.record.kind}/{found.name}"]
+                figures |= dict.fromkeys(names, found.record.figures())
     return figures
 
 

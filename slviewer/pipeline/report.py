@@ -31,7 +31,7 @@ from slviewer.pipeline.models import (
 from slviewer.pipeline.open_session import SessionLike, opened
 from slviewer.pipeline.poses import load_observations
 from slviewer.pipeline.scale import describe_scale
-from slviewer.pipeline.stored_records import list_records
+from slviewer.pipeline.stored_records import list_records, load_arrays, name_records
 from slviewer.records.kinds import RECORDS
 from slviewer.records.plain import from_plain
 from slviewer.records.verification import Verification
@@ -151,10 +151,10 @@ def _collect_records(store: Session) -> tuple[list[RecordsView], list[str]]:
         figures: list[Figure] = []
         for each in fresh[:MOST_MAPS]:
             if isinstance(each.record, Verification):
-                arrays = store.load_result(f"{kind.kind}/{each.name}")[1]
+                arrays = load_arrays(store, f"{kind.kind}/{each.name}")
                 figures.append(verification_maps(each.label, each.record, arrays))
         if fresh:
-            views.append(RecordsView(kind, {each.label: each.record for each in fresh}, figures))
+            views.append(RecordsView(kind, name_records(fresh), figures))
     return views, stale
 
 

@@ -1,6 +1,7 @@
 """The records of a session: saved, loaded and listed by their kinds."""
 
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
@@ -62,13 +63,25 @@ def list_records(store: Session, kind: type[R]) -> list[Stored[R]]:
         name = result.removeprefix(f"{kind.kind}/")
         record = load_record(store, kind, name)
         if there.issuperset(captures_of(name, record)):
-            records.append(Stored(name, str(labels.get(name, name)), record, not is_up_to_date(store, result)))
+            stale = store.state_of(result) != "fresh" or not _has_scales(store, record.scales)
+            records.append(Stored(name, str(labels.get(name, name)), record, stale))
     return records
+
+
+def name_records(found: Sequence[Stored[R]]) -> dict[str, R]:
+    """Return records by their labels, with the name beside a label that several have."""
+    counts = Counter(each.label for each in found)
+    names = (each.label if counts[each.label] == 1 else f"{each.label} ({each.name})" for each in found)
+    return {name: each.record for name, each in zip(names, found, strict=True)}
 
 
 def is_up_to_date(store: Session, result: str) -> bool:
     """Whether a result's inputs are as they were, and no correction of scale has changed since."""
     if store.state_of(result) != "fresh":
         return False
-    scales = store.load_result(result, only=())[0].get("scales", {})
+    return _has_scales(store, store.load_result(result, only=())[0].get("scales", {}))
+
+
+def _has_scales(store: Session, scales: Mapping[str, float]) -> bool:
+    """Whether these are the corrections of scale in force, by model."""
     return all(scale_factor(store, model) == factor for model, factor in scales.items())

@@ -84,14 +84,10 @@ def sphere_table(rows: Sequence[SphereRow], caption: str) -> Table:
 
 
 def spacing_table(rows: Sequence[SpacingRow], caption: str) -> Table:
-    """Distances between spheres, known (where they are) and measured; flatness is blind to scale and shear, these are
+    """Distances between spheres, known and measured; flatness is blind to scale and shear, these are
     not."""
     measured = _values_by_model(rows, "measured_mm")
     names: _CellColumn = (Column("spheres", align="left"), [*(row.name for row in rows), "mean size of the error"])
-    if not any(np.isfinite(row.known_mm) for row in rows):
-        plain = [(Column(model, "mm"), [format_number(v) for v in values]) for model, values in measured.items()]
-        table = _build_table([names, *plain], caption)
-        return replace(table, footer=())
     errors = _signed_errors(measured, measured, [row.known_mm for row in rows])
     columns: list[_CellColumn] = [
         names,

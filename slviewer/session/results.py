@@ -109,9 +109,9 @@ def verify_result(folder: Path) -> None:
         raise _damage(folder, "its hash differs from the saved one")
 
 
-def read_arrays(folder: Path, only: Collection[str] | None = None) -> dict[str, np.ndarray]:
-    """The arrays of a result (those named in `only`); DamagedError where one is missing or not what was saved."""
-    meta = read_meta(folder)
+def read_arrays(folder: Path, meta: Mapping[str, Any], only: Collection[str] | None = None) -> dict[str, np.ndarray]:
+    """The arrays of a result with that meta (those named in `only`); DamagedError where one is missing or not what was
+    saved."""
     names, checksums = meta.get("arrays", []), meta.get("checksums", {})
     if only is not None and (unknown := set(only) - set(names)):
         raise InputError(f"{folder.name} holds no array {sorted(unknown)}: it holds {names}")

@@ -328,7 +328,7 @@ class Session(Decisions):
         if not (folder / "meta.json").is_file():
             there = ", ".join(self.result_names()) or "none"
             raise InputError(f"there is no result {name!r} in {self.folder}: the results are {there}")
-        return read_meta(folder), read_arrays(folder, only)
+        return (meta := read_meta(folder)), read_arrays(folder, meta, only)
 
     def decode_result(
         self,

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from slviewer.errors import DamagedError
-from slviewer.pipeline.stored_records import load_record
+from slviewer.pipeline.stored_records import Stored, load_record, name_records
 from slviewer.records.drift import Drift
 from slviewer.records.kinds import RECORDS
 from slviewer.records.merge import Merge
@@ -80,6 +80,16 @@ def test_every_record_has_figures_a_summary_and_tables(session: Session) -> None
         (table, *_) = RECORDS[kind].tables({name: record})
         assert record.summary() and table.rows and table.columns[0].title
         assert record.figures() or kind == "placement"
+
+
+def test_records_of_one_label_are_all_named(session: Session) -> None:
+    record = load_record(session, Verification, "sphere_1")
+    found = [
+        Stored("sphere_1", "ball", record),
+        Stored("sphere_2", "ball", record),
+        Stored("plane_03", "plate", record),
+    ]
+    assert list(name_records(found)) == ["ball (sphere_1)", "ball (sphere_2)", "plate"]
 
 
 def test_a_record_of_other_types_is_damaged(session: Session) -> None:

@@ -114,6 +114,7 @@ class ExportPanel(StepPanel):
     key = "export"
     layers = (LAYER,)
     _points: np.ndarray | None = None
+    _drawn: SessionView | None = None
 
     def build(self) -> None:
         """Create the inputs and lists of files."""
@@ -188,9 +189,14 @@ class ExportPanel(StepPanel):
             change(button, disabled=unusable or not things)
         change(self._table, disabled=snapshot.is_busy or not session.records)
         change(self._figures_folder, visible=bool(session.records))
-        labels = {scan.name: scan.label for scan in session.scans}
-        self._figures.set("".join(records_html(session.list_records(kind), labels) for kind in RECORDS.values()))
+        self._draw_figures(session)
         self._describe()
+
+    def _draw_figures(self, session: SessionView) -> None:
+        """Show the tables of all records, drawn again only where the session has changed."""
+        if session is not self._drawn:
+            self._drawn, labels = session, {scan.name: scan.label for scan in session.scans}
+            self._figures.set("".join(records_html(session.list_records(kind), labels) for kind in RECORDS.values()))
 
     def show(self, visible: bool) -> None:
         """Show or hide the layers, and move the views to the cloud."""

@@ -11,7 +11,7 @@ from slviewer.gui.pictures import PLOT_PX, Plot
 from slviewer.gui.preview import draw_preview, exposure_html, legend
 from slviewer.gui.simulated_object import SimulatedObject
 from slviewer.gui.widgets import Picture, Text, colour_bar, colours, link, paragraph, records_html
-from slviewer.pipeline.stored_records import Stored
+from slviewer.pipeline.stored_records import Stored, load_arrays
 from slviewer.records.verification import Shape, Verification
 from slviewer.report.maps import SIGN, error_limit, verification_maps
 from slviewer.report.page import Figure
@@ -202,5 +202,5 @@ def shape_of(scan: ScanView) -> str:
 
 def _draw_maps(session: Session, view: Stored[Verification]) -> Figure:
     """Draw the error maps of a capture by model."""
-    arrays = session.load_result(f"{Verification.kind}/{view.name}")[1]
+    arrays = load_arrays(session, f"{Verification.kind}/{view.name}")
     return verification_maps(display_name(view.name, view.label), view.record, arrays, PLOT_PX)
