@@ -8,6 +8,7 @@ import sys
 for library in ("OMP", "OPENBLAS", "NUMBA"):
     os.environ.setdefault(f"{library}_NUM_THREADS", "1")
 
+import gc
 import json
 import subprocess
 import time
@@ -16,6 +17,7 @@ from pathlib import Path
 
 import pytest
 from chromium import launched
+from clocks import HANG_S
 from filelock import FileLock
 from numba.core import event
 from playwright.sync_api import Browser, sync_playwright
@@ -30,6 +32,16 @@ NEEDS = ("browser", "process", "computes", "slow")
 """What a test may need; one that needs none of these is quick."""
 MAX_QUICK_COMPILE_S = 10.0
 """Processor seconds that a quick test may spend compiling kernels, on a busy machine; 3 s on a quiet one."""
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Generator[None, object, object]:
+    """Collect without looking for garbage: nothing of what is collected becomes any."""
+    gc.disable()
+    found = yield
+    gc.freeze()
+    gc.enable()
+    return found
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -115,8 +127,10 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a ``session`` as the commands simulate and calibrate it, and ``calibration.json``, what they found.
 
     8 poses, planes, spheres and objects at quarter resolution, made once for all workers: only to be read or copied.
+    The frames of all captures are checked, as the wizard does when it opens a session.
     """
     from slviewer.cli import main
+    from slviewer.wizard.operator import Operator
 
     base = tmp_path_factory.getbasetemp()
     folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "recorded"
@@ -126,6 +140,8 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
             with fit_few_cells():
                 assert main(["simulate", str(session), "--scale", "0.25", "--poses", "8"]) == 0
                 assert main(["calibrate", str(session), "--target", "circles:21x16:9", "--json", str(found)]) == 0
+            with Operator(session) as operator:
+                operator.wait_until_idle(HANG_S)
     assert json.loads(found.read_text())["poses_used"], "the worker that made it failed"
     return folder
 

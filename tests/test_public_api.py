@@ -2,13 +2,13 @@
 
 import re
 import runpy
-import shutil
 import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from copies import copy_session
 
 import slviewer as sl
 from slviewer.session.toml import describe_sequence
@@ -75,7 +75,7 @@ def test_examples_need_nothing_below_slviewer() -> None:
 
 @pytest.mark.computes
 def test_a_session_has_the_operations_as_methods(recorded: Path, tmp_path: Path) -> None:
-    folder = shutil.copytree(recorded / "session", tmp_path / "session")
+    folder = copy_session(recorded / "session", tmp_path / "session")
     with sl.Session.open(folder, write=True) as session:
         found = session.verify(["plane_03"], "plane")
         assert found["plane_03"].best == "splined" and session.state_of("verify/plane_03") == "fresh"

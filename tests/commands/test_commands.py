@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from copies import copy_session
 from facts import missing_facts
 from small_fields import fit_few_cells
 
@@ -22,7 +23,7 @@ Run = Callable[..., tuple[int, str, str]]
 @pytest.fixture(scope="module")
 def session(recorded: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A copy of what `simulate` and `calibrate` made."""
-    return Path(shutil.copytree(recorded / "session", tmp_path_factory.mktemp("commands") / "session"))
+    return copy_session(recorded / "session", tmp_path_factory.mktemp("commands") / "session")
 
 
 @pytest.fixture(scope="module")
@@ -159,7 +160,7 @@ def test_reproduce_remakes_the_letters_tables_and_figures(session: Path, run: Ru
 
 @pytest.mark.slow
 def test_calibrate_names_an_excluded_pose_and_does_not_use_it(recorded: Path, run: Run, tmp_path: Path) -> None:
-    session = shutil.copytree(recorded / "session", tmp_path / "session")
+    session = copy_session(recorded / "session", tmp_path / "session")
     with Session.open(session, write=True) as store:
         store.exclude("pose_02", "blurred")
     status, text, _ = run("calibrate", session, "--target", "circles:21x16:9", "--models", "stereo")

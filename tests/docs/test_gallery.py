@@ -4,7 +4,6 @@ import importlib.util
 import inspect
 import os
 import runpy
-import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -15,6 +14,7 @@ from typing import Any
 import matplotlib
 import matplotlib.pyplot as plt
 import pytest
+from copies import copy_session
 
 from slviewer.pipeline import simulate as simulation
 
@@ -74,7 +74,7 @@ def test_the_notebook_of_a_live_cloud_runs_on_a_simulated_session(
         """Stands for `simulate`, of which it checks the arguments."""
         bound = inspect.signature(simulate).bind(*arguments, **options).arguments
         assert (bound["scale"], bound["poses"]) == (0.25, 8)  # of the recorded session
-        shutil.copytree(recorded / "session", bound["session"])
+        copy_session(recorded / "session", bound["session"])
 
     simulate = simulation.simulate
     monkeypatch.setattr(simulation, "simulate", copy_recorded)

@@ -3,7 +3,6 @@
 import csv
 import json
 import re
-import shutil
 import threading
 from collections.abc import Iterator
 from contextlib import suppress
@@ -14,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
+from copies import copy_session
 from playwright.sync_api import Browser, Page, expect
 from playwright.sync_api import TimeoutError as NotShownError
 from wizard_page import (
@@ -63,7 +63,7 @@ def measured(
     recorded: Path, tmp_path_factory: pytest.TempPathFactory, browser: Browser
 ) -> Iterator[tuple[Page, Operator, list[str]]]:
     """A page on a copy of the recorded session, without a rig, and without the model that takes longest to compare."""
-    folder = shutil.copytree(recorded / "session", tmp_path_factory.mktemp("measured") / "session")
+    folder = copy_session(recorded / "session", tmp_path_factory.mktemp("measured") / "session")
     with Session.open(folder, write=True) as store:
         store.trash_result("calibration/splined")
     with Operator(folder, timing=CALM) as engine:

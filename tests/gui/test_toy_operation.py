@@ -10,6 +10,7 @@ from typing import ClassVar
 
 import pytest
 from clocks import HANG_S
+from copies import copy_session
 from playwright.sync_api import Browser, expect
 from wizard_page import CALM, click, new_page
 
@@ -62,7 +63,9 @@ def registered() -> Iterator[None]:
 
 @pytest.fixture
 def session(recorded: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(recorded / "session", tmp_path / "session"))
+    """The captures alone: certificates repeat no calibration."""
+    others = shutil.ignore_patterns("calibration", "poses", "evidence", "compiled", "plane_*", "sphere_*")
+    return copy_session(recorded / "session", tmp_path / "session", others)
 
 
 @pytest.mark.computes
@@ -87,7 +90,7 @@ def test_terminal_json_csv_report_and_certificate_hold_the_figure(
 
 @pytest.mark.computes
 def test_python_and_wizard_store_what_the_terminal_does(session: Path, tmp_path: Path) -> None:
-    again = shutil.copytree(session, tmp_path / "again")
+    again = copy_session(session, tmp_path / "again")
     (found,) = brightness(session, "object_r1").values()
     with Operator(again) as operator:
         assert operator.run("brightness", capture="object_r1")

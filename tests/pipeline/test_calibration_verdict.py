@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from copies import copy_session
 from facts import missing_facts
 
 from slviewer.calibration.diagnosis.verdict import Finding, Verdict
@@ -45,7 +46,7 @@ def fill(folder: Path, bench: FaultBench, period_px: float = 18.0, force: bool =
 def session(recorded: Path, tmp_path: Path) -> Path:
     """A copy of a session with a sound calibration."""
     others = shutil.ignore_patterns("object_*", "plane_*", "sphere_*")
-    return Path(shutil.copytree(recorded / "session", tmp_path / "session", ignore=others))
+    return copy_session(recorded / "session", tmp_path / "session", ignore=others)
 
 
 @pytest.fixture

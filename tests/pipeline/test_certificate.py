@@ -8,6 +8,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
+from copies import copy_session
 from facts import missing_facts, raises
 
 from slviewer.errors import InputError
@@ -46,7 +47,7 @@ def certified(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 @pytest.fixture(scope="module")
 def calibrated(recorded: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """The recorded session without splined, with measurements; and the report of it."""
-    folder = Path(shutil.copytree(recorded / "session", tmp_path_factory.mktemp("calibrated") / "session"))
+    folder = copy_session(recorded / "session", tmp_path_factory.mktemp("calibrated") / "session")
     with Session.open(folder, write=True) as store:
         store.trash_result("calibration/splined")
     return folder, measured_report(folder, "pixelwise")

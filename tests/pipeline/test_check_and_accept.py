@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from artefact_places import Place, bar_places
+from copies import copy_session
 from facts import missing_facts, raises
 from sound_checks import save_sound_checks
 
@@ -141,7 +142,7 @@ def test_accept_names_what_is_missing(bare, tmp_path):
 def calibrated(recorded: Path, tmp_path: Path) -> Path:
     """A copy of the recorded session: its target poses, and their calibration."""
     folder, others = tmp_path / "session", shutil.ignore_patterns("object_*", "plane_*", "sphere_*")
-    return Path(shutil.copytree(recorded / "session", folder, ignore=others))
+    return copy_session(recorded / "session", folder, ignore=others)
 
 
 def capture_board(folder: Path, name: str) -> None:

@@ -1,6 +1,5 @@
 """One operation, one record: the terminal, Python and the wizard store the same results of the same session."""
 
-import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from clocks import HANG_S
+from copies import copy_session
 
 import slviewer as sl
 from slviewer.cli import main
@@ -18,6 +18,8 @@ from slviewer.pipeline.certificate import make_certificate
 from slviewer.pipeline.reconstruct import ReconstructSettings
 from slviewer.session.store import Session
 from slviewer.wizard.operator import Operator
+
+pytestmark = pytest.mark.computes
 
 
 @dataclass(frozen=True)
@@ -119,12 +121,12 @@ def done(
 ) -> tuple[Operation, dict[str, Path]]:
     """An operation, and a session for each door by which it was asked for; all were equal before."""
     folder, operation = tmp_path_factory.mktemp("contract"), OPERATIONS[request.param]
-    sessions = {door: shutil.copytree(recorded / "session", folder / door) for door in DOORS}
+    first = copy_session(recorded / "session", folder / "first")
+    with Session.open(first, write=True) as store:
+        board = store.load_capture("pose_03")
+        store.save_capture("later", "scan", board.sequence, board.frames, source="simulated")
+    sessions = {door: copy_session(first, folder / door) for door in DOORS}
     (folder / "ball.toml").write_text(BALL)
-    for session in sessions.values():
-        with Session.open(session, write=True) as store:
-            board = store.load_capture("pose_03")
-            store.save_capture("later", "scan", board.sequence, board.frames, source="simulated")
     for door, session in sessions.items():
         DOORS[door](operation, session)
     return operation, sessions
@@ -177,7 +179,7 @@ def test_what_the_terminal_made_is_done_in_the_wizard_and_certified(done: tuple[
 
 
 def test_verify_stores_the_cloud_that_reconstruct_does(recorded: Path, tmp_path: Path) -> None:
-    first, second = (shutil.copytree(recorded / "session", tmp_path / name) for name in ("verified", "reconstructed"))
+    first, second = (copy_session(recorded / "session", tmp_path / name) for name in ("verified", "reconstructed"))
     sl.verify(first, ["plane_03"], "plane")
     sl.reconstruct(second, "plane_03")
     (verified,), (made,) = (records(session, ("clouds/plane_03",)).values() for session in (first, second))
@@ -186,7 +188,7 @@ def test_verify_stores_the_cloud_that_reconstruct_does(recorded: Path, tmp_path:
 
 def test_a_changed_capture_makes_the_record_stale(done: tuple[Operation, dict[str, Path]], tmp_path: Path) -> None:
     operation, sessions = done
-    folder = shutil.copytree(sessions["python"], tmp_path / "session")
+    folder = copy_session(sessions["python"], tmp_path / "session")
     with Session.open(folder, write=True) as store:
         capture = store.load_capture(operation.capture)
         frames = np.maximum(capture.frames, 1)
@@ -195,7 +197,7 @@ def test_a_changed_capture_makes_the_record_stale(done: tuple[Operation, dict[st
 
 
 def test_a_session_in_use_is_read_and_the_result_is_not_stored(recorded: Path, tmp_path: Path) -> None:
-    session, warnings = shutil.copytree(recorded / "session", tmp_path / "session"), list[str]()
+    session, warnings = copy_session(recorded / "session", tmp_path / "session"), list[str]()
     with Session.open(session, write=True) as store:
         settings = ReconstructSettings("object_r1", out=tmp_path / "cloud.ply")
         made = sl.reconstruct.run(session, settings, warn=warnings.append)
@@ -209,7 +211,7 @@ def test_a_session_in_use_is_read_and_the_result_is_not_stored(recorded: Path, t
 def test_no_file_appears_whose_record_could_not_be_stored(
     name: str, recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    session = shutil.copytree(recorded / "session", tmp_path / "session")
+    session = copy_session(recorded / "session", tmp_path / "session")
 
     def refuse(*_: object) -> None:
         raise SessionError("the disk is full")

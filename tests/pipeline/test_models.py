@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from copies import copy_session
 from facts import missing_facts, raises
 
 from slviewer.calibration.splined import model as splined
@@ -27,7 +28,7 @@ def test_a_calibration_of_another_layout_is_refused_with_what_to_do(tmp_path: Pa
 
 @pytest.mark.slow
 def test_a_calibration_of_a_model_that_is_no_more_is_ignored(recorded: Path, tmp_path: Path) -> None:
-    folder = Path(shutil.copytree(recorded / "session", tmp_path / "session"))
+    folder = copy_session(recorded / "session", tmp_path / "session")
     with Session.open(folder, write=True) as store:
         store.save_result("calibration/anchored", {"model": {"axes": ["x"]}, "inputs": {}}, {"z": np.eye(2)})
         store.decide("model", "anchored")
@@ -56,7 +57,7 @@ def test_what_is_stale_is_told_in_one_sentence(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_the_wizard_opens_a_session_of_another_version_and_says_what_to_do(recorded: Path, tmp_path: Path) -> None:
-    folder = Path(shutil.copytree(recorded / "session", tmp_path / "session"))
+    folder = copy_session(recorded / "session", tmp_path / "session")
     shutil.rmtree(folder / "results" / "calibration" / "splined")
     with Session.open(folder, write=True) as store:
         meta = store.load_result("calibration/pixelwise", only=())[0]
@@ -71,7 +72,7 @@ def test_the_wizard_opens_a_session_of_another_version_and_says_what_to_do(recor
 
 @pytest.mark.parametrize("name", ["pixelwise", pytest.param("splined", marks=pytest.mark.slow)])
 def test_a_calibration_is_loaded_again_only_when_it_has_changed(recorded: Path, tmp_path: Path, name: str) -> None:
-    folder = Path(shutil.copytree(recorded / "session", tmp_path / "session"))
+    folder = copy_session(recorded / "session", tmp_path / "session")
     with Session.open(folder, write=True) as store:
         first = load_model(store, name)
         assert load_model(store, name) is first
@@ -85,7 +86,7 @@ def test_a_calibration_is_loaded_again_only_when_it_has_changed(recorded: Path, 
 def test_what_a_calibration_compiles_is_saved_and_belongs_to_it_alone(
     recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    folder = Path(shutil.copytree(recorded / "session", tmp_path / "session"))
+    folder = copy_session(recorded / "session", tmp_path / "session")
     compiled: list[str] = []
     for name in ("compile_axis", "compute_sigma_map"):
         make = getattr(splined, name)

@@ -2,7 +2,6 @@
 
 import csv
 import importlib
-import shutil
 import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -12,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
+from copies import copy_session
 from facts import missing_facts, raises
 from scipy.spatial import cKDTree
 from small_fields import fit_few_cells
@@ -59,7 +59,7 @@ def operator(recorded: Path, tmp_path_factory: pytest.TempPathFactory, acts: lis
         pass
     for pose in (f"pose_{i:02d}" for i in range(1, POSES)):
         for place in (f"captures/{pose}", *(f"results/{made}/{pose}" for made in ("poses", "evidence", "trust"))):
-            shutil.copytree(recorded / "session" / place, folder / place)
+            copy_session(recorded / "session" / place, folder / place)
     with flown(folder, "p18", acts) as operator:
         yield operator
 
